@@ -1,0 +1,75 @@
+"""A line of the workflow table: which stage, at what fan-out, reading and writing what."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel
+
+from scanloom.schemas.errors import UsageError
+from scanloom.schemas.product import Product
+
+AXES: dict[str, tuple[str, ...]] = {
+    "map": (),
+    "session": ("session",),
+    "chunk": ("session", "chunk"),
+    "submap": ("session", "submap"),
+    "tile": ("tile",),
+    "pair": ("pair",),
+}
+"""Axes along which each `per` fans out. A part of a product stands at the axes of the task that wrote it,
+plus the axis it is split along (`SPLIT_BY`). A task reads the parts that agree with it on the axes both have:
+a single product when the part has no axis the task lacks, else `Parts`, ordered."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """One stage of a workflow. `settings` and `version` come from the stage's module."""
+
+    name: str
+    stage: Callable[..., Any]
+    per: str
+    reads: tuple[type[Product], ...]
+    writes: tuple[type[Product], ...]
+    settings: type[BaseModel]
+    version: int
+    title: str
+    only: str | None = None
+    """Runs for sessions with this tag only (for instance `simulated`)."""
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        return AXES[self.per]
+
+
+def node(
+    name: str,
+    stage: Callable[..., Any],
+    *,
+    per: str,
+    reads: tuple[type[Product], ...] = (),
+    writes: type[Product] | tuple[type[Product], ...],
+    title: str = "",
+    only: str | None = None,
+) -> Node:
+    """Declare a line of a workflow.
+
+    `stage(settings, *products)` gets its products in the order of `reads`, and returns a product, a tuple of products,
+    or an iterator of products and `Part`s; each is written before the next is asked for.
+
+    Raises
+    ------
+    UsageError : `per` is unknown, or the stage's module has no `Settings` or no `VERSION`.
+    """
+    if per not in AXES:
+        raise UsageError(f"node {name}: per={per!r} is none of {', '.join(AXES)}")
+    module = sys.modules[stage.__module__]
+    try:
+        settings, version = module.Settings, module.VERSION
+    except AttributeError as error:
+        raise UsageError(f"node {name}: module {stage.__module__} lacks Settings or VERSION") from error
+    outputs = writes if isinstance(writes, tuple) else (writes,)
+    return Node(name, stage, per, reads, outputs, settings, version, title or name, only)

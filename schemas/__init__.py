@@ -1,0 +1,1 @@
+"""What flows: the products, their columns, units and frames."""

@@ -1,0 +1,30 @@
+"""The pose graph after optimisation: every factor with what became of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.schemas.product import Table, column
+
+
+@dataclass(frozen=True)
+class Graph(Table):
+    """One row per factor. Keys name keyframes as `session/scan_index`."""
+
+    NAME: ClassVar[str] = "graph"
+
+    kind: NDArray[np.object_] = column("str", "`odometry`, `loop`, `gnss`, `gravity` or `prior`")
+    key_i: NDArray[np.object_] = column("str", "first pose")
+    key_j: NDArray[np.object_] = column("str", "second pose; empty for a factor on one pose")
+    measurement: NDArray[np.float64] = column(
+        "f8", "relative pose of a between factor; for gnss the position in the last column", unit="m", shape=(4, 4)
+    )
+    covariance: NDArray[np.float64] = column("f8", "order (rotation, translation); unused rows are zero", shape=(6, 6))
+    residual_before: NDArray[np.float64] = column("f8", "whitened norm at the initial values")
+    residual_after: NDArray[np.float64] = column("f8", "whitened norm at the solution")
+    weight: NDArray[np.float64] = column("f8", "final robust weight, 0 switched off to 1 trusted")
+    verdict: NDArray[np.object_] = column("str", "`used`, or why it was left out")

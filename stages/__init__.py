@@ -1,0 +1,1 @@
+"""How each product is computed: pure functions, one stage a module."""

@@ -1,0 +1,1 @@
+"""Which stages, wired for a purpose, and the command line."""
