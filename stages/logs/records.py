@@ -14,7 +14,6 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-
 from scanloom.schemas.session import Extrinsic, Problem
 from scanloom.stages.geometry.se3 import F8
 
@@ -47,7 +46,8 @@ class Cloud:
     """What the decoder found odd or had to guess (for instance `field time taken as seconds after the header`)."""
 
 
-class PointField(NamedTuple):
+@dataclass(frozen=True)
+class PointField:
     """One field of a PointCloud2: datatype as in sensor_msgs/PointField (1 int8 ... 7 float32, 8 float64)."""
 
     name: str
