@@ -20,7 +20,7 @@ class Georeference(BaseModel):
     """Where the local east-north-up frame `world` stands on the Earth.
 
     A point (e, n, u) of `world` near the origin has projected coordinates
-    `(easting_m, northing_m) + point_scale * R(-grid_convergence_rad) @ (e, n)` in `epsg`
+    `(easting_m, northing_m) + point_scale * R(grid_convergence_rad) @ (e, n)` in `epsg` (R counter-clockwise)
     to within a centimetre per kilometre; `stages.geometry.geodesy` has the exact transformation.
     """
 
@@ -37,3 +37,4 @@ class Georeference(BaseModel):
     grid_convergence_rad: float
     """Angle from true north to grid north, clockwise positive."""
     point_scale: float
+    """Map length over true length at the origin's own height."""
