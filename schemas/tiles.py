@@ -47,6 +47,7 @@ class Tile(Table):
     frame: str = attribute("`world` or `map`")
     georeference: dict[str, Any] | None = attribute("fields of `frames.Georeference`, or null")
     voxel_size_m: float = attribute("edge of a voxel, m")
+    tile_size_m: float = attribute("edge of a tile, m")
     sessions: tuple[str, ...] = attribute("sessions that contributed")
 
 

@@ -1,0 +1,107 @@
+"""Overview: the list of tiles, and the whole map as one cloud."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from scanloom.schemas.errors import StageError
+from scanloom.schemas.product import Parts, columns_of
+from scanloom.schemas.tiles import MapFiles, Tile, TileIndex
+from scanloom.stages.tiling import ply
+from scanloom.stages.tiling.grid import tile_position
+
+VERSION = 1
+
+
+class Settings(BaseModel):
+    """How coarse the one-file map is."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    map_voxel_size_m: float = Field(0.2, ge=0.01, le=10.0, description="edge of a voxel of map.ply, m")
+
+
+def overview(settings: Settings, tiles: Parts[Tile]) -> tuple[TileIndex, MapFiles]:
+    """List the tiles with bounds and checksums, and write `map.ply` tile by tile.
+
+    `map.ply` has float32 coordinates from the origin of the map: steps of 0.06 mm at 1 km and 1 mm at 10 km.
+
+    Raises
+    ------
+    StageError : the map has no tiles.
+    """
+    if len(tiles) == 0:
+        raise StageError(
+            "the map has no tiles: no point was kept",
+            next_step="look at the labels and at `tiling.classes`, which says which classes enter the map",
+        )
+    index = tile_index(tiles)
+    picks = [coarse_picks(tile, settings.map_voxel_size_m) for tile in tiles]
+
+    def write_map(stream: IO[bytes]) -> None:
+        comments = ply.georeference_comments(index.frame, index.georeference, (0.0, 0.0, 0.0))
+        stream.write(ply.header(sum(map(len, picks)), ["scanloom map", *comments]))
+        for tile, picked in zip(tiles, picks):
+            stream.write(_vertices(tile, picked))
+
+    return index, MapFiles(contents={"map.ply": write_map})
+
+
+def tile_index(tiles: Parts[Tile]) -> TileIndex:
+    """One row per tile, ordered by (x, y)."""
+    rows = sorted(
+        ((tile_position(c["tile"]), c["tile"], tile) for c, tile in tiles.items()), key=lambda row: row[0]
+    )
+    first = rows[0][2]
+    bounds = [_bounds(tile) for _, _, tile in rows]
+    return TileIndex(
+        tile=np.array([name for _, name, _ in rows], object),
+        level=np.zeros(len(rows), np.int32),
+        points=np.array([len(tile) for _, _, tile in rows], np.int64),
+        min_m=np.array([low for low, _ in bounds]),
+        max_m=np.array([high for _, high in bounds]),
+        sessions=np.array([" ".join(tile.sessions) for _, _, tile in rows], object),
+        checksum=np.array([checksum(tile) for _, _, tile in rows], object),
+        frame=first.frame,
+        georeference=first.georeference,
+        tile_size_m=first.tile_size_m,
+        voxel_size_m=first.voxel_size_m,
+    )
+
+
+def checksum(tile: Tile) -> str:
+    """SHA-256 over the bytes of all columns in their declared order, little-endian."""
+    digest = hashlib.sha256()
+    for name in columns_of(Tile):
+        digest.update(np.ascontiguousarray(getattr(tile, name)).data)
+    return digest.hexdigest()
+
+
+def _bounds(tile: Tile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    offset = np.array(tile.offset_m)
+    if len(tile) == 0:
+        return offset, offset
+    axes = (tile.x_m, tile.y_m, tile.z_m)
+    low = np.array([axis.min() for axis in axes], float)
+    return offset + low, offset + np.array([axis.max() for axis in axes], float)
+
+
+def coarse_picks(tile: Tile, voxel_size_m: float) -> NDArray[np.int64]:
+    """Indices of the tile's points that are the first of their coarse voxel, in order."""
+    if voxel_size_m <= tile.voxel_size_m:
+        return np.arange(len(tile))
+    points = np.column_stack((tile.x_m, tile.y_m, tile.z_m))
+    keys = np.floor(points / voxel_size_m).astype(np.int64) @ np.array([1 << 42, 1 << 21, 1])
+    return np.sort(np.unique(keys, return_index=True)[1])
+
+
+def _vertices(tile: Tile, picks: NDArray[np.int64]) -> bytes:
+    """Vertices of some points of a tile, in the frame of the map."""
+    local = np.column_stack((tile.x_m[picks], tile.y_m[picks], tile.z_m[picks]))
+    points = (local + np.array(tile.offset_m)).astype(np.float32)
+    return ply.vertices(points, tile.intensity[picks], tile.class_[picks])

@@ -1,0 +1,116 @@
+"""Tiles: pieces of all chunks and sessions merged into the voxel-filtered points of one tile."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from scanloom.schemas.errors import StageError
+from scanloom.schemas.product import Parts
+from scanloom.schemas.scans import PointClass
+from scanloom.schemas.tiles import Piece, Tile, TileFiles
+from scanloom.stages.tiling import ply
+from scanloom.stages.tiling.grid import tile_position
+
+VERSION = 1
+
+
+class Settings(BaseModel):
+    """Which voxels become points of the map."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    min_points: int = Field(1, ge=1, le=1000, description="points a voxel needs to enter the map")
+    min_scans: int = Field(
+        1, ge=1, le=1000, description="different scans of one chunk or more that must hit a voxel"
+    )
+
+
+def tiles(settings: Settings, pieces: Parts[Piece]) -> tuple[Tile, TileFiles]:
+    """Merge the pieces of one tile: the mean point, mean intensity and majority class of every voxel.
+
+    The sums are exact (see `voxel_sums`), hence the tile does not depend on the order of the pieces.
+
+    Raises
+    ------
+    StageError : there are no pieces, or they belong to different grids or tiles.
+    """
+    name, sessions = _identity(pieces)
+    merged = merge(list(pieces))
+    kept = merged.take((merged.count >= settings.min_points) & (merged.scan_count >= settings.min_scans))
+    tile = _average(kept, name, sessions)
+    return tile, TileFiles(contents={"tile.ply": tile_ply(tile)})
+
+
+def merge(pieces: list[Piece]) -> Piece:
+    """Add up pieces of one tile voxel by voxel; voxels come out ordered by (x, y, z) index."""
+    everything = Piece.concatenate(pieces)
+    keys = _keys(everything.voxel)
+    order = np.argsort(keys, kind="stable")  # timsort: the pieces come sorted, so this is a merge
+    starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    return Piece(
+        voxel=everything.voxel[order[starts]],
+        count=_sum_runs(everything.count, order, starts),
+        sum_m=_sum_runs(everything.sum_m, order, starts),
+        sum_intensity=_sum_runs(everything.sum_intensity, order, starts),
+        ground_count=_sum_runs(everything.ground_count, order, starts),
+        scan_count=_sum_runs(everything.scan_count, order, starts),
+        **everything.attributes,
+    )
+
+
+def _keys(voxel: NDArray[np.int32]) -> NDArray[np.int64]:
+    """One number per voxel that orders as (x, y, z); x and y are below 1024, z within 2^30 of zero."""
+    x, y, z = voxel.astype(np.int64).T
+    return (x << 42) | (y << 32) | (z + (1 << 30))
+
+
+def _sum_runs(values: NDArray, order: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray:
+    if len(starts) == 0:
+        return values[order]
+    return np.add.reduceat(values[order], starts, axis=0).astype(values.dtype)
+
+
+def _identity(pieces: Parts[Piece]) -> tuple[str, tuple[str, ...]]:
+    """Name of the tile and the sessions that contribute."""
+    coordinates = [coordinate for coordinate, _ in pieces.items()]
+    names = {coordinate["tile"] for coordinate in coordinates}
+    if len(names) != 1:
+        raise StageError(f"expected the pieces of one tile, got those of {len(names)}")
+    grids = {(p.voxel_size_m, p.tile_size_m, p.frame, str(p.georeference)) for p in pieces}
+    if len(grids) != 1:
+        raise StageError(
+            "the pieces of this tile were made with different grids or georeferences",
+            where=f"tile {names.pop()}",
+            next_step="run tiling again for all sessions with the same settings",
+        )
+    return names.pop(), tuple(sorted({c["session"] for c in coordinates if "session" in c}))
+
+
+def _average(sums: Piece, name: str, sessions: tuple[str, ...]) -> Tile:
+    x, y = tile_position(name)
+    count = np.maximum(sums.count, 1)
+    mean = (sums.sum_m / count[:, None]).astype(np.float32)
+    ground = 2 * sums.ground_count > sums.count
+    return Tile(
+        x_m=np.ascontiguousarray(mean[:, 0]),
+        y_m=np.ascontiguousarray(mean[:, 1]),
+        z_m=np.ascontiguousarray(mean[:, 2]),
+        intensity=(sums.sum_intensity / count).astype(np.float32),
+        class_=np.where(ground, PointClass.GROUND, PointClass.STATIC).astype(np.uint8),
+        count=sums.count,
+        offset_m=(x * sums.tile_size_m, y * sums.tile_size_m, 0.0),
+        frame=sums.frame,
+        georeference=sums.georeference,
+        voxel_size_m=sums.voxel_size_m,
+        tile_size_m=sums.tile_size_m,
+        sessions=sessions,
+    )
+
+
+def tile_ply(tile: Tile) -> bytes:
+    """The tile as PLY: coordinates from the tile's origin, the origin and the CRS in the comments."""
+    comments = ["scanloom tile", *ply.georeference_comments(tile.frame, tile.georeference, tile.offset_m)]
+    points = np.column_stack((tile.x_m, tile.y_m, tile.z_m))
+    return ply.header(len(tile), comments) + ply.vertices(points, tile.intensity, tile.class_)
