@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scanloom.schemas.session import Extrinsic, Problem
 from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.sweep import Sweep
 
 StampAt = Literal["start", "middle", "end"]
 """Which moment of a sweep the stamp of its header names."""
@@ -44,6 +45,8 @@ class Cloud:
     """What `stamp_ns` names; used only where `time_ns` is None."""
     remark: str = ""
     """What the decoder found odd or had to guess (for instance `field time taken as seconds after the header`)."""
+    sweep: Sweep | None = None
+    """How the LiDAR turned, where the format fixes it (KITTI); None when it is to be read from the points' order."""
 
 
 @dataclass(frozen=True)
