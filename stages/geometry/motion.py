@@ -1,0 +1,311 @@
+"""Motion of the vehicle from its gyro and its wheels: how the LiDAR moved between any two times.
+
+How to use it (deskew does, odometry may):
+
+    track = MotionTrack.build(imu, wheel, session)          # whole-session tables; cheap, nothing is integrated yet
+    track.has_rotation, track.has_translation                # which sensors are usable at all
+    cover = track.covers(t_a_ns, t_b_ns)                     # Coverage(rotation: bool, translation: bool) of a stretch
+    T_a_b = track.relative(t_a_ns, t_b_ns)                   # (4, 4): LiDAR at b in the LiDAR frame at a
+    T_ref_t = track.poses(at_ns, reference_ns)               # (m, 4, 4): LiDAR at each time in its frame at reference
+    track.gyro_bias_rad_s, track.standstill                  # (3,) in the IMU frame; (k, 2) intervals in ns
+
+Where rotation is not covered it is taken as none, and where translation is not covered the base origin is taken as
+standing: ask `covers` first, or pass a `twist` of the LiDAR (from registration, say) that stands in for what is
+missing. Model (methods 1.4): attitude from the bias-free gyro, wheel speed along x of the base at the wheels'
+position, no side slip, lever arms through the extrinsics.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.schemas.session import Session
+from scanloom.schemas.tracks import Imu, Wheel
+from scanloom.stages.geometry.kernels import kernel
+from scanloom.stages.geometry.se3 import F8, inverse
+
+I8 = NDArray[np.int64]
+
+MAX_GYRO_RAD_S = 35.0  # 2000 deg/s, the range of the fastest common gyros
+MAX_SPEED_M_S = 100.0
+STILL_SPEED_M_S = 0.02
+STILL_GYRO_STD_RAD_S = 0.02
+STILL_ACCEL_STD_M_S2 = 0.25
+MAX_BIAS_RAD_S = 0.05
+MAX_MEAN_TILT_RAD = np.radians(45.0)
+LONGEST_STEP_NS = 20_000_000
+NOTHING = np.zeros((0, 2), np.int64)
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Which parts of the motion over a stretch of time the sensors tell."""
+
+    rotation: bool
+    translation: bool
+
+
+@dataclass(frozen=True)
+class MotionTrack:
+    """Angular rate and speed of the vehicle over time. See the module for its use."""
+
+    gyro_ns: I8
+    rate_base: F8
+    """(n, 3) angular rate in the base frame without bias, rad/s."""
+    wheel_ns: I8
+    speed_m_s: F8
+    T_base_lidar: F8
+    wheel_position: F8
+    """(3,) the point without side slip, in the base frame, m."""
+    gyro_bias_rad_s: F8
+    standstill: I8
+    max_gyro_gap_ns: int = 300_000_000
+    max_wheel_gap_ns: int = 1_000_000_000
+
+    @classmethod
+    def build(
+        cls, imu: Imu, wheel: Wheel, session: Session, *,
+        wheel_scale: float = 1.0, max_gyro_gap_s: float = 0.3, max_wheel_gap_s: float = 1.0,
+    ) -> MotionTrack:  # fmt: skip
+        """From the sensors of a session.
+
+        Rows with NaN, absurd values or a repeated stamp are dropped. An IMU whose gravity does not point up within
+        45 degrees has wrong extrinsics and is not used. Without a gyro the wheels' own turn rate is used if given.
+        """
+        T_base_imu = np.array(session.T_base("imu"))
+        wheel_ns, speed, yaw_rate = _clean_wheel(wheel)
+        imu_ns, gyro, accel = _clean_imu(imu)
+        if not gravity_points_up(accel, T_base_imu):
+            imu_ns, gyro, accel = imu_ns[:0], gyro[:0], accel[:0]
+        still = standstill_intervals(wheel_ns, speed, imu_ns, gyro, accel)
+        bias = gyro_bias(imu_ns, gyro, still)
+        rate = (gyro - bias) @ T_base_imu[:3, :3].T
+        if len(imu_ns) == 0 and np.isfinite(yaw_rate).any():
+            turning = np.isfinite(yaw_rate)
+            imu_ns, rate = (
+                wheel_ns[turning],
+                np.column_stack((*np.zeros((2, turning.sum())), yaw_rate[turning])),
+            )
+        return cls(
+            imu_ns, rate, wheel_ns, speed * wheel_scale, np.array(session.T_base("lidar")),
+            np.array(session.T_base("wheel"))[:3, 3], bias, still,
+            round(max_gyro_gap_s * 1e9), round(max_wheel_gap_s * 1e9),
+        )  # fmt: skip
+
+    @property
+    def has_rotation(self) -> bool:
+        return len(self.gyro_ns) > 1
+
+    @property
+    def has_translation(self) -> bool:
+        return len(self.wheel_ns) > 1
+
+    def covers(self, start_ns: int, end_ns: int) -> Coverage:
+        """Which parts of the motion from `start_ns` to `end_ns` (in either order) the sensors tell without a long gap."""
+        start, end = min(start_ns, end_ns), max(start_ns, end_ns)
+        return Coverage(
+            rotation=_without_gap(self.gyro_ns, start, end, self.max_gyro_gap_ns),
+            translation=_without_gap(self.wheel_ns, start, end, self.max_wheel_gap_ns),
+        )
+
+    def relative(self, a_ns: int, b_ns: int, twist: F8 | None = None) -> F8:
+        """T_a_b (4, 4) of the LiDAR between two times; `twist` as for `poses`."""
+        return self.poses(np.array([b_ns]), a_ns, twist)[0]
+
+    def poses(self, at_ns: I8, reference_ns: int, twist: F8 | None = None) -> F8:
+        """T_reference_t (m, 4, 4) of the LiDAR at the times `at_ns` (m,), in any order.
+
+        twist : (6,) rotation rate and velocity of the LiDAR in its own frame (rad/s, m/s); stands in for what the
+            sensors do not cover between the first and the last time. No motion gives exact identities.
+        """
+        at_ns = np.asarray(at_ns, np.int64)
+        if len(at_ns) == 0:
+            return np.zeros((0, 4, 4))
+        first, last = min(int(at_ns.min()), reference_ns), max(int(at_ns.max()), reference_ns)
+        cover = self.covers(first, last)
+        node_ns = self._nodes(at_ns, reference_ns, first, last)
+        rate, velocity = self._rates(node_ns, cover, twist)
+        time_s = np.asarray(1e-9 * (node_ns - first), np.float64)
+        T_first_base = integrate(time_s, rate, velocity)
+        T_reference_base = inverse(T_first_base[np.searchsorted(node_ns, reference_ns)]) @ T_first_base
+        moved = T_reference_base[np.searchsorted(node_ns, at_ns)] - np.eye(4)
+        T_reference_lidar: F8 = np.eye(4) + inverse(self.T_base_lidar) @ moved @ self.T_base_lidar
+        return T_reference_lidar
+
+    def _nodes(self, at_ns: I8, reference_ns: int, first: int, last: int) -> I8:
+        """Times at which the motion is evaluated: those asked for, the measurements, and none far apart."""
+        steps = np.arange(first, last, LONGEST_STEP_NS, dtype=np.int64)
+        gyro = _within(self.gyro_ns, first, last)
+        wheel = _within(self.wheel_ns, first, last)
+        return np.unique(np.concatenate((at_ns, [reference_ns], steps, gyro, wheel)).astype(np.int64))
+
+    def _rates(self, node_ns: I8, cover: Coverage, twist: F8 | None) -> tuple[F8, F8]:
+        """Angular rate and velocity (k, 3) of the base origin in the base frame."""
+        R, lever = self.T_base_lidar[:3, :3], self.T_base_lidar[:3, 3]
+        rate, velocity = np.zeros((2, len(node_ns), 3))
+        if cover.rotation:
+            rate = np.column_stack([_sample(self.gyro_ns, self.rate_base[:, k], node_ns) for k in range(3)])
+        elif twist is not None:
+            rate = rate + R @ twist[:3]
+        if cover.translation:
+            velocity[:, 0] = _sample(self.wheel_ns, self.speed_m_s, node_ns)
+            velocity = velocity - np.cross(rate, self.wheel_position)
+        elif twist is not None:
+            velocity = velocity + R @ twist[3:] - np.cross(rate, lever)
+        return rate, velocity
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def integrate(time_s: F8, rate: F8, velocity: F8) -> F8:
+    """Poses T_0_k (n, 4, 4) at increasing times (n,) from body rates (n, 3), rad/s, and body velocities (n, 3), m/s.
+
+    R_{k+1} = R_k Exp(w dt), p_{k+1} = p_k + R_k Exp(w dt / 2) v dt with the mean w, v of the two ends (methods 1.4).
+    """
+    n = len(time_s)
+    T = np.zeros((n, 4, 4))
+    for i in range(4):
+        T[:, i, i] = 1.0
+    half = np.eye(3)
+    for k in range(n - 1):
+        dt = time_s[k + 1] - time_s[k]
+        w = 0.5 * (rate[k] + rate[k + 1])
+        v = 0.5 * (velocity[k] + velocity[k + 1])
+        _exp(0.5 * dt * w, half)
+        R = T[k, :3, :3]
+        middle = _product(R, half)
+        T[k + 1, :3, :3] = _product(middle, half)
+        for i in range(3):
+            T[k + 1, i, 3] = T[k, i, 3] + dt * (
+                middle[i, 0] * v[0] + middle[i, 1] * v[1] + middle[i, 2] * v[2]
+            )
+    return T
+
+
+@kernel
+def _product(A: F8, B: F8) -> F8:
+    C = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+    return C
+
+
+@kernel
+def _exp(w: F8, R: F8) -> None:
+    """Rodrigues' formula, written into R."""
+    x, y, z = w[0], w[1], w[2]
+    angle = np.sqrt(x * x + y * y + z * z)
+    if angle < 1e-6:
+        a, b = 1.0 - angle * angle / 6.0, 0.5
+    else:
+        a, b = np.sin(angle) / angle, 2.0 * (np.sin(0.5 * angle) / angle) ** 2
+    R[0, 0] = 1.0 - b * (y * y + z * z)
+    R[1, 1] = 1.0 - b * (x * x + z * z)
+    R[2, 2] = 1.0 - b * (x * x + y * y)
+    R[0, 1], R[1, 0] = b * x * y - a * z, b * x * y + a * z
+    R[0, 2], R[2, 0] = b * x * z + a * y, b * x * z - a * y
+    R[1, 2], R[2, 1] = b * y * z - a * x, b * y * z + a * x
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def standstill_intervals(
+    wheel_ns: I8, speed_m_s: F8, imu_ns: I8, gyro: F8, accel: F8, *, least_s: float = 1.0
+) -> I8:
+    """Intervals (k, 2), ns, in which the vehicle stood for more than `least_s`.
+
+    By the wheels where there are any; else by an IMU that shakes as little as one at rest and hardly turns.
+    """
+    if len(wheel_ns) > 1:
+        return _runs(wheel_ns, np.abs(speed_m_s) < STILL_SPEED_M_S, round(least_s * 1e9))
+    if len(imu_ns) < 4:
+        return NOTHING
+    second = (imu_ns - imu_ns[0]) // round(least_s * 1e9)
+    first_of, count = np.unique(second, return_index=True, return_counts=True)[1:]
+    starts = first_of[count >= 8]
+    quiet = [_quiet(gyro[i : i + n], accel[i : i + n]) for i, n in zip(starts, count[count >= 8])]
+    ends = [imu_ns[i + n - 1] for i, n in zip(starts, count[count >= 8])]
+    pairs = [(imu_ns[i], end) for i, end, still in zip(starts, ends, quiet) if still]
+    return np.array(pairs, np.int64).reshape(-1, 2)
+
+
+def gyro_bias(imu_ns: I8, gyro: F8, standstill: I8) -> F8:
+    """Mean gyro output (3,), rad/s, while the vehicle stood: the median over its stops; zero when it never stood."""
+    means = []
+    for start, end in standstill:
+        part = gyro[np.searchsorted(imu_ns, start) : np.searchsorted(imu_ns, end, side="right")]
+        if len(part) >= 8 and np.all(part.std(axis=0) < STILL_GYRO_STD_RAD_S):
+            means.append(part.mean(axis=0))
+    if not means:
+        return np.zeros(3)
+    bias: F8 = np.median(means, axis=0)
+    return bias if np.all(np.abs(bias) < MAX_BIAS_RAD_S) else np.zeros(3)
+
+
+def gravity_points_up(accel: F8, T_base_imu: F8) -> bool:
+    """Whether the mean specific force is upward in the base frame; true when there is none to judge by."""
+    known = accel[np.isfinite(accel).all(axis=1)]
+    if len(known) == 0:
+        return True
+    up = T_base_imu[:3, :3] @ np.median(known, axis=0)
+    norm = float(np.linalg.norm(up))
+    return norm < 5.0 or up[2] > norm * np.cos(MAX_MEAN_TILT_RAD)
+
+
+def _quiet(gyro: F8, accel: F8) -> bool:
+    shaking = gyro.std(axis=0).max() > STILL_GYRO_STD_RAD_S or accel.std(axis=0).max() > STILL_ACCEL_STD_M_S2
+    return not shaking and bool(np.linalg.norm(gyro.mean(axis=0)) < MAX_BIAS_RAD_S)
+
+
+def _runs(stamp_ns: I8, holds: NDArray[np.bool_], least_ns: int) -> I8:
+    """Intervals (k, 2) in which `holds` is true throughout and which last at least `least_ns`."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], holds, [False])).astype(np.int8)))
+    spans = np.column_stack((stamp_ns[edges[::2]], stamp_ns[edges[1::2] - 1]))
+    kept: I8 = spans[spans[:, 1] - spans[:, 0] > least_ns]
+    return kept
+
+
+def _clean_imu(imu: Imu) -> tuple[I8, F8, F8]:
+    good = np.isfinite(imu.gyro_rad_s).all(axis=1) & (np.abs(imu.gyro_rad_s) < MAX_GYRO_RAD_S).all(axis=1)
+    rows = _ordered(imu.stamp_ns, np.flatnonzero(good))
+    return imu.stamp_ns[rows], imu.gyro_rad_s[rows], imu.accel_m_s2[rows]
+
+
+def _clean_wheel(wheel: Wheel) -> tuple[I8, F8, F8]:
+    good = np.isfinite(wheel.speed_m_s) & (np.abs(wheel.speed_m_s) < MAX_SPEED_M_S)
+    rows = _ordered(wheel.stamp_ns, np.flatnonzero(good))
+    return wheel.stamp_ns[rows], wheel.speed_m_s[rows], wheel.yaw_rate_rad_s[rows]
+
+
+def _ordered(stamp_ns: I8, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The rows by increasing stamp, the first of equal stamps."""
+    return rows[np.unique(stamp_ns[rows], return_index=True)[1]]
+
+
+def _without_gap(stamp_ns: I8, start: int, end: int, longest_ns: int) -> bool:
+    """Whether the samples around [start, end] are never further apart than `longest_ns`, nor end earlier than that."""
+    if len(stamp_ns) < 2 or start < stamp_ns[0] - longest_ns or end > stamp_ns[-1] + longest_ns:
+        return False
+    i = max(int(np.searchsorted(stamp_ns, start, side="right")) - 1, 0)
+    j = min(int(np.searchsorted(stamp_ns, end)), len(stamp_ns) - 1)
+    return j <= i or bool(np.diff(stamp_ns[i : j + 1]).max() <= longest_ns)
+
+
+def _within(stamp_ns: I8, first: int, last: int) -> I8:
+    return stamp_ns[np.searchsorted(stamp_ns, first) : np.searchsorted(stamp_ns, last, side="right")]
+
+
+def _sample(stamp_ns: I8, value: F8, at_ns: I8) -> F8:
+    """Linear interpolation; the end values are held. Only the samples around the wanted times are touched."""
+    i = max(int(np.searchsorted(stamp_ns, at_ns[0], side="right")) - 1, 0)
+    j = int(np.searchsorted(stamp_ns, at_ns[-1])) + 1
+    origin = stamp_ns[i]
+    sampled: F8 = np.interp((at_ns - origin) * 1e-9, (stamp_ns[i:j] - origin) * 1e-9, value[i:j])
+    return sampled
