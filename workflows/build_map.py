@@ -1,0 +1,203 @@
+"""One map from start to finish: find the logs, run the stages, deliver the folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import platform
+import time
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from scanloom.pipeline.plan import PlannedTask, Request, SessionInput
+from scanloom.pipeline.plan import plan as plan_tasks
+from scanloom.pipeline.progress import Progress
+from scanloom.pipeline.run import Result, run
+from scanloom.pipeline.store import Store
+from scanloom.schemas.errors import EXIT_INTERNAL, EXIT_OK, EXIT_SOME_FAILED, ScanloomError
+from scanloom.schemas.evaluation import Metrics, ReportFiles
+from scanloom.schemas.session import Session
+from scanloom.schemas.tiles import TileIndex
+from scanloom.stages.report.page import compose, run_section
+from scanloom.workflows.configuration import Overrides, merged
+from scanloom.workflows.delivery import Metric, claim, deliver, metric_rows, write_text
+from scanloom.workflows.map_session import NODES
+from scanloom.workflows.sessions import find_sessions
+
+METRICS_FILE = "metrics.json"
+REPORT_FILE = "report.html"
+
+
+@dataclass(frozen=True)
+class Order:
+    """What is to be mapped, where to, and how."""
+
+    sessions: tuple[str, ...]
+    out: Path
+    name: str
+    store: Path
+    cluster: str = "local"
+    workers: int | None = None
+    project: Overrides = field(default_factory=dict)
+    command_line: Overrides = field(default_factory=dict)
+    started_s: float = field(default_factory=time.time)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of it: the folder, its figures, and what failed."""
+
+    out: Path
+    exit_code: int
+    delivered: bool
+    metrics: list[Metric]
+    executed: int
+    failures: list[tuple[str, ScanloomError]]
+    warnings: list[str]
+    result: Result | None = None
+
+
+def plan_map(order: Order) -> tuple[list[PlannedTask], list[tuple[str, ScanloomError]]]:
+    """What `build_map` would do, and the logs it could not use; computes nothing."""
+    request, errors = _request(order)
+    if not request.sessions:
+        return [], errors
+    return plan_tasks(request, Store(order.store)), errors
+
+
+def build_map(order: Order, progress: Progress | None = None) -> Outcome:
+    """Run every stage that is needed and fill the map's folder.
+
+    A log that cannot be used is reported and left out; the map is made of the others.
+    """
+    request, errors = _request(order)
+    if not request.sessions:
+        return Outcome(order.out, _exit_code(errors, delivered=False), False, [], 0, errors, [])
+    claim(order.out)
+    result = run(request, Store(order.store), cluster=order.cluster, workers=order.workers, progress=progress)
+    failures = errors + [(_place(task), task.error) for task in result.failures if task.error is not None]
+    delivered = bool(result.files(ReportFiles)) and bool(result.files(TileIndex))
+    metrics: list[Metric] = []
+    if delivered:
+        deliver(result, order.out, order.name)
+        metrics = _deliver_figures(order, result)
+    return Outcome(
+        out=order.out,
+        exit_code=_exit_code(failures, delivered),
+        delivered=delivered,
+        metrics=metrics,
+        executed=result.executed,
+        failures=failures,
+        warnings=_warnings(result),
+        result=result,
+    )
+
+
+def _request(order: Order) -> tuple[Request, list[tuple[str, ScanloomError]]]:
+    sessions, errors = find_sessions(order.sessions)
+    with_command_line = tuple(
+        dataclasses.replace(s, settings=merged(s.settings, order.command_line)) if s.settings else s
+        for s in sessions
+    )
+    settings = merged(order.project, order.command_line)
+    return Request(nodes=NODES, sessions=with_command_line, settings=settings), errors
+
+
+def _deliver_figures(order: Order, result: Result) -> list[Metric]:
+    """`metrics.json` and `report.html`. Their `run.*` part describes the last run that computed something."""
+    metrics = metric_rows(result.parts(Metrics)[0])
+    previous = _run_metrics(order.out / METRICS_FILE)
+    figures = previous if result.executed == 0 and previous else _measured(order, result)
+    metrics += figures
+    write_text(order.out / METRICS_FILE, json.dumps(metrics, indent=1) + "\n")
+    if result.executed or not (order.out / REPORT_FILE).exists():
+        body = result.files(ReportFiles)[0][1] / "body.html"
+        page = compose(body.read_text(), run_section(_stage_times(result), _provenance(order, figures)), order.name)
+        write_text(order.out / REPORT_FILE, page)
+    return metrics
+
+
+def _measured(order: Order, result: Result) -> list[Metric]:
+    wall_s = time.time() - order.started_s
+    log_s = sum(session.duration_s for session in result.parts(Session))
+    peak_mb = max(result.peak_rss_mb, psutil.Process(os.getpid()).memory_info().rss / 1e6)
+
+    def row(name: str, value: float, unit: str, method: str) -> Metric:
+        return {"name": name, "value": round(value, 3), "unit": unit, "scope": "run", "method": method}
+
+    return [
+        row("run.wall_s", wall_s, "s", "from the start of the command to the delivery of the map"),
+        row("run.log_s", log_s, "s", "length of all logs, first to last message"),
+        row("run.realtime_factor", log_s / wall_s, "", "seconds of log per second of run"),
+        row("run.peak_rss_mb", peak_mb, "MB", "resident memory of all processes of the run together, sampled"),
+        row("run.tasks_executed", result.executed, "", "tasks computed, not found in the store"),
+        row("run.tasks", len(result.tasks), "", "tasks of the run"),
+    ]
+
+
+def _run_metrics(path: Path) -> list[Metric]:
+    try:
+        rows: list[Metric] = json.loads(path.read_text())
+        return [row for row in rows if row["scope"] == "run"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+
+
+def _stage_times(result: Result) -> list[dict[str, Any]]:
+    """One row per stage, in the order of the workflow."""
+    rows: dict[str, dict[str, Any]] = {
+        n.name: {"stage": n.name, "tasks": 0, "executed": 0, "wall_s": 0.0, "peak_rss_mb": 0.0} for n in NODES
+    }
+    for task in result.tasks:
+        row = rows[task.node]
+        row["tasks"] += 1
+        if task.verdict == "RUN":
+            row["executed"] += 1
+            row["wall_s"] += task.wall_s
+            row["peak_rss_mb"] = max(row["peak_rss_mb"], task.peak_rss_mb)
+    return [row for row in rows.values() if row["tasks"]]
+
+
+def _provenance(order: Order, figures: list[Metric]) -> dict[str, str]:
+    by_name = {row["name"]: row["value"] for row in figures}
+    return {
+        "scanloom": metadata.version("scanloom"),
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        "made": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
+        "sessions": ", ".join(order.sessions),
+        "settings changed": json.dumps(merged(order.project, order.command_line)) or "none",
+        "wall time": f"{by_name.get('run.wall_s', 0):.1f} s for {by_name.get('run.log_s', 0):.1f} s of log",
+        "real-time factor": f"{by_name.get('run.realtime_factor', 0):.2f}",
+        "peak memory": f"{by_name.get('run.peak_rss_mb', 0):.0f} MB",
+    }
+
+
+def _warnings(result: Result) -> list[str]:
+    """Problems of the logs that a user should read even when all went well."""
+    return [
+        f"{session.name}: {problem.text}"
+        for session in result.parts(Session)
+        for problem in session.problems
+        if problem.severity != "info"
+    ]
+
+
+def _place(task: Any) -> str:
+    where = "/".join(task.coordinate.values())
+    return f"{task.node}{' ' + where if where else ''}"
+
+
+def _exit_code(failures: list[tuple[str, ScanloomError]], delivered: bool) -> int:
+    """0 all well, 3 a map without some sessions, else the first error's own code."""
+    if not failures:
+        return EXIT_OK if delivered else EXIT_INTERNAL
+    return EXIT_SOME_FAILED if delivered else failures[0][1].exit_code
+
+
+__all__ = ["Order", "Outcome", "SessionInput", "build_map", "plan_map"]

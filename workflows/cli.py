@@ -1,0 +1,315 @@
+"""The command line: the only module that prints or exits."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import psutil
+import typer
+
+from scanloom.schemas.errors import EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_OK, ScanloomError
+
+app = typer.Typer(
+    name="scanloom",
+    help="Weaves vehicle and robot logs into georeferenced, cleaned, tiled 3D maps.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+StoreOption = Annotated[
+    Path | None, typer.Option("--store", help="Folder of the artifact store (default $SCANLOOM_STORE or ./store).")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable result on stdout.")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", help="A setting, stage.field=value; may be repeated.")
+]
+ClusterOption = Annotated[
+    str, typer.Option("--cluster", help="local, none, tcp://host:port or module:factory.")
+]
+WorkersOption = Annotated[int | None, typer.Option("--workers", min=1, help="Local processes (default: one per core).")]
+ProjectOption = Annotated[
+    Path | None, typer.Option("--project", help="Settings file (default ./scanloom.yaml when present).")
+]
+
+
+def main() -> None:
+    """Entry point: errors become one clear sentence and an exit code."""
+    logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    try:
+        app(standalone_mode=False)
+    except ScanloomError as error:
+        _fail(str(error), error.exit_code)
+    except KeyboardInterrupt:
+        _fail("interrupted; the same command continues where it stopped", EXIT_INTERRUPTED)
+    except typer.Exit as exit_:
+        sys.exit(exit_.exit_code)
+    except Exception as error:
+        _unexpected(error)
+
+
+def _unexpected(error: Exception) -> None:
+    usage = getattr(error, "exit_code", None)
+    if usage is not None and hasattr(error, "format_message"):
+        error.show()  # type: ignore[attr-defined]
+        sys.exit(usage)
+    if os.environ.get("SCANLOOM_DEBUG"):
+        raise error
+    _fail(
+        f"internal error: {type(error).__name__}: {error}. Next: run again with SCANLOOM_DEBUG=1 to see where, and report it",
+        EXIT_INTERNAL,
+    )
+
+
+def _fail(message: str, code: int) -> None:
+    print(f"scanloom: {message}", file=sys.stderr)
+    sys.exit(code)
+
+
+def _say(message: str) -> None:
+    print(message, file=sys.stderr)
+
+
+def _emit(body: Any) -> None:
+    print(json.dumps(body, indent=1, default=str))
+
+
+def _store_folder(given: Path | None) -> Path:
+    return given or Path(os.environ.get("SCANLOOM_STORE", "store"))
+
+
+@app.command("map")
+def map_command(
+    sessions: Annotated[list[str], typer.Argument(help="Logs: bag, folder, .mcap, KITTI folder, session.yaml, or `sample`.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of the map (default maps/NAME).")] = None,
+    store: StoreOption = None,
+    cluster: ClusterOption = "local",
+    workers: WorkersOption = None,
+    settings: SetOption = None,
+    project: ProjectOption = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would run and why; compute nothing.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Logs into a map: trajectory, tiles, metrics and a report."""
+    from scanloom.pipeline.progress import for_terminal
+    from scanloom.workflows.build_map import Order, build_map, plan_map
+    from scanloom.workflows.configuration import command_line_settings, project_settings
+    from scanloom.workflows.sessions import map_name
+
+    name = out.name if out else map_name(sessions)
+    order = Order(
+        sessions=tuple(sessions),
+        out=out or Path("maps") / name,
+        name=name,
+        store=_store_folder(store),
+        cluster=cluster,
+        workers=workers,
+        project=project_settings(project),
+        command_line=command_line_settings(settings or []),
+        started_s=psutil.Process().create_time(),
+    )
+    if dry_run:
+        _show_plan(*plan_map(order), as_json)
+        return
+    with for_terminal() as progress:
+        outcome = build_map(order, progress)
+    _show_outcome(outcome, as_json)
+    raise typer.Exit(outcome.exit_code)
+
+
+def _show_plan(tasks: list[Any], errors: list[tuple[str, ScanloomError]], as_json: bool) -> None:
+    if as_json:
+        rows = [
+            {"node": t.node, "coordinate": t.coordinate, "verdict": t.verdict, "reason": t.reason} for t in tasks
+        ]
+        _emit({"tasks": rows, "failures": [str(error) for _, error in errors]})
+    else:
+        for task in tasks:
+            place = "/".join(task.coordinate.values())
+            print(f"{task.verdict:5} {task.node:11} {place:24} {task.reason}")
+        for _, error in errors:
+            _say(f"scanloom: {error}")
+    if errors and not tasks:
+        raise typer.Exit(errors[0][1].exit_code)
+
+
+def _show_outcome(outcome: Any, as_json: bool) -> None:
+    for text in outcome.warnings:
+        _say(f"warning: {text}")
+    for place, error in outcome.failures:
+        _say(f"scanloom: {place}: {error}")
+    if as_json:
+        _emit(
+            {
+                "out": str(outcome.out) if outcome.delivered else None,
+                "exit_code": outcome.exit_code,
+                "executed": outcome.executed,
+                "metrics": outcome.metrics,
+                "warnings": outcome.warnings,
+                "failures": [{"where": place, "error": str(error)} for place, error in outcome.failures],
+            }
+        )
+    elif outcome.delivered:
+        _say(f"map: {outcome.out}   report: {outcome.out / 'report.html'}")
+        for row in outcome.metrics:
+            if row["name"] in HEADLINE:
+                print(f"{row['name']:36} {row['value']:12.4g} {row['unit']}")
+
+
+HEADLINE = {
+    "odometry.kitti_t_rel_percent",
+    "odometry.path_length_m",
+    "fusion.ate_rmse_m",
+    "loops.accepted",
+    "loops.precision",
+    "map.points",
+    "map.mme_r0.5_nat",
+    "run.wall_s",
+    "run.realtime_factor",
+    "run.peak_rss_mb",
+}
+
+
+@app.command()
+def sample(
+    folder: Annotated[Path, typer.Argument(help="Where the log and the truth beside it are written.")],
+    settings: SetOption = None,
+    store: StoreOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write the embedded sample session: a rosbag2 MCAP log from the simulator, with truth beside it."""
+    from scanloom.workflows.configuration import command_line_settings
+    from scanloom.workflows.sample import write_sample
+
+    files = write_sample(folder, _store_folder(store), command_line_settings(settings or []))
+    if as_json:
+        _emit({"folder": str(folder), "files": files})
+    else:
+        print(f"{folder}: {', '.join(files)}")
+
+
+@app.command()
+def inspect(
+    session: Annotated[str, typer.Argument(help="A log, as for `map`.")],
+    settings: SetOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """What is in a log, what would be used, what is wrong with it; computes nothing."""
+    from scanloom.workflows.configuration import command_line_settings
+    from scanloom.workflows.inspection import inspection_of, text_of
+
+    found = inspection_of(session, command_line_settings(settings or []))
+    if as_json:
+        _emit(found)
+    else:
+        print(text_of(found))
+
+
+@app.command()
+def nightly(
+    fleet: Annotated[Path, typer.Argument(help="FLEET.yaml: maps, each with sessions by path or glob.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of the maps and the summary (default: the file's).")] = None,
+    store: StoreOption = None,
+    cluster: ClusterOption = "local",
+    workers: WorkersOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Many logs, many maps, one summary; a bad log never stops the night."""
+    from scanloom.pipeline.progress import for_terminal
+    from scanloom.workflows.nightly import run_fleet
+
+    with for_terminal() as progress:
+        night = run_fleet(
+            fleet, out, _store_folder(store), cluster=cluster, workers=workers, progress=progress
+        )
+    for row in night.failures:
+        _say(f"scanloom: {row}")
+    if as_json:
+        _emit(night.summary)
+    else:
+        print(f"summary: {night.page}")
+    raise typer.Exit(night.exit_code)
+
+
+@app.command()
+def explain(
+    artifact: Annotated[str, typer.Argument(help="Key of an artifact (a prefix will do), or its folder.")],
+    store: StoreOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Why an artifact is what it is: stage, settings, code version, inputs."""
+    from scanloom.workflows.housekeeping import explanation, text_of_explanation
+
+    found = explanation(_store_folder(store), artifact)
+    if as_json:
+        _emit(found)
+    else:
+        print(text_of_explanation(found))
+
+
+@app.command()
+def status(store: StoreOption = None, as_json: JsonOption = False) -> None:
+    """What the store holds, and how the last runs ended."""
+    from scanloom.workflows.housekeeping import store_status, text_of_status
+
+    found = store_status(_store_folder(store))
+    if as_json:
+        _emit(found)
+    else:
+        print(text_of_status(found))
+
+
+@app.command()
+def verify(store: StoreOption = None, as_json: JsonOption = False) -> None:
+    """Read every artifact again and compare checksums; damaged ones are set aside and made anew by the next run."""
+    from scanloom.workflows.housekeeping import verify_store
+
+    found = verify_store(_store_folder(store))
+    if as_json:
+        _emit(found)
+    else:
+        for problem in found["problems"]:
+            print(problem)
+        print(f"{found['checked']} artifacts checked, {len(found['problems'])} damaged")
+    raise typer.Exit(EXIT_INTERNAL if found["problems"] else EXIT_OK)
+
+
+@app.command()
+def gc(
+    store: StoreOption = None,
+    keep_runs: Annotated[int, typer.Option("--keep-runs", min=0, help="Keep what the last N runs used.")] = 5,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would go; remove nothing.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Remove artifacts that no recent run used, and leftovers of killed runs."""
+    from scanloom.workflows.housekeeping import collect_garbage
+
+    found = collect_garbage(_store_folder(store), keep_runs, dry_run)
+    if as_json:
+        _emit(found)
+    else:
+        verb = "would free" if dry_run else "freed"
+        print(f"{verb} {found['bytes'] / 1e6:.1f} MB in {found['artifacts']} artifacts")
+
+
+@app.command(hidden=True)
+def warm() -> None:
+    """Compile the numerical kernels once, so that the first map does not wait for it."""
+    from scanloom.workflows.warming import is_warm, warm_kernels
+
+    if is_warm():
+        return
+    _say("setup: compiling the numerical kernels (once per version of the code)")
+    started = time.monotonic()
+    warm_kernels()
+    _say(f"setup: done in {time.monotonic() - started:.0f} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,195 @@
+"""What a user gets: the folder of a map, filled from the store."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scanloom.pipeline.run import Result
+from scanloom.schemas.errors import StoreError, UsageError
+from scanloom.schemas.evaluation import Metrics, ReportFiles
+from scanloom.schemas.session import Session
+from scanloom.schemas.tiles import MapFiles, Tile, TileFiles, TileIndex
+from scanloom.schemas.trajectory import Poses
+from scanloom.stages.geometry.se3 import quaternion_from_matrix
+
+MARKER = ".scanloom"
+MAP_FILE = "map.json"
+Metric = dict[str, Any]
+
+
+def claim(out: Path) -> None:
+    """Make the folder of a map, or refuse one that holds something else.
+
+    Raises
+    ------
+    UsageError : the folder is not empty and was not made by a map.
+    """
+    if out.is_file():
+        raise UsageError("is a file, not a folder", where=str(out), next_step="give another --out")
+    if out.is_dir() and any(out.iterdir()) and not (out / MARKER).exists():
+        raise UsageError(
+            "is not empty and does not hold a map",
+            where=str(out),
+            next_step="give --out a new folder; nothing there was touched",
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    (out / MARKER).touch()
+
+
+@dataclass(frozen=True)
+class Item:
+    """One file to deliver: an existing file or bytes."""
+
+    name: str
+    source: Path | bytes
+
+
+def deliver(result: Result, out: Path, name: str) -> dict[str, Any]:
+    """Fill the folder with everything that does not vary between runs; returns the content of `map.json`."""
+    items = list(_items(result))
+    previous = read_map(out)
+    old = previous.get("files", {})
+    files: dict[str, dict[str, Any]] = {}
+    for item in items:
+        digest, size = _digest(item.source)
+        files[item.name] = {"sha256": digest, "bytes": size}
+        if old.get(item.name) != files[item.name] or not _same_size(out / item.name, size):
+            place(item.source, out / item.name)
+    for stale in set(old) - set(files):
+        (out / stale).unlink(missing_ok=True)
+    content = {**_description(result, name), "files": files}
+    place((json.dumps(content, indent=1, sort_keys=True) + "\n").encode(), out / MAP_FILE)
+    return content
+
+
+def read_map(out: Path) -> dict[str, Any]:
+    """Content of `map.json`, empty when there is none or it was cut off."""
+    try:
+        content: dict[str, Any] = json.loads((out / MAP_FILE).read_text())
+    except (OSError, ValueError):
+        return {}
+    return content
+
+
+def write_text(path: Path, text: str) -> None:
+    """Whole or not at all."""
+    place(text.encode(), path)
+
+
+def metric_rows(metrics: Metrics) -> list[Metric]:
+    """Rows as they stand in `metrics.json`; the session is named when there is more than one."""
+    several = len({s for s in metrics.session if s}) > 1
+    rows = []
+    for i in range(len(metrics)):
+        row = {key: getattr(metrics, key)[i] for key in ("name", "value", "unit", "scope", "method")}
+        row["value"] = float(row["value"])
+        if several and metrics.session[i]:
+            row["session"] = metrics.session[i]
+        rows.append(row)
+    return rows
+
+
+def _items(result: Result) -> Iterable[Item]:
+    sessions = result.parts(Session)
+    for coordinate, path in result.files(MapFiles):
+        yield Item("map.ply", path / "map.ply")
+    for coordinate, path in result.files(Tile):
+        yield Item(f"tiles/{coordinate['tile']}.parquet", path)
+    for coordinate, path in result.files(TileFiles):
+        yield Item(f"tiles/{coordinate['tile']}.ply", path / "tile.ply")
+    for _, path in result.files(TileIndex):
+        yield Item("tiles/index.parquet", path)
+    for coordinate, path in result.files(Poses):
+        stem = "trajectory" if len(sessions) == 1 else f"trajectory/{coordinate['session']}"
+        yield Item(f"{stem}.parquet", path)
+        yield Item(f"{stem}.tum", trajectory_tum(Poses.open(path)))
+    for _, path in result.files(ReportFiles):
+        yield Item("preview.png", path / "preview.png")
+
+
+def trajectory_tum(poses: Poses) -> bytes:
+    """One line per scan: `stamp tx ty tz qx qy qz qw`; the stamp keeps its nanoseconds."""
+    q = quaternion_from_matrix(poses.T_world_lidar[:, :3, :3])
+    t = poses.T_world_lidar[:, :3, 3]
+    lines = []
+    for stamp, (x, y, z), (qw, qx, qy, qz) in zip(poses.stamp_ns, t, q, strict=True):
+        seconds, nanoseconds = divmod(int(stamp), 1_000_000_000)
+        lines.append(
+            f"{seconds}.{nanoseconds:09d} {x:.6f} {y:.6f} {z:.6f} {qx:.9f} {qy:.9f} {qz:.9f} {qw:.9f}\n"
+        )
+    return "".join(lines).encode()
+
+
+def _description(result: Result, name: str) -> dict[str, Any]:
+    index = result.parts(TileIndex)[0]
+    keys = {coordinate["session"]: path.parent.name for coordinate, path in result.files(Session)}
+    sessions = [
+        {
+            "name": s.name,
+            "scans": s.scan_count,
+            "start_ns": s.start_ns,
+            "end_ns": s.end_ns,
+            "complete": s.complete,
+            "problems": [p.text for p in s.problems if p.severity != "info"],
+        }
+        for s in result.parts(Session)
+    ]
+    bounds = (index.min_m.min(axis=0), index.max_m.max(axis=0)) if len(index) else (np.zeros(3), np.zeros(3))
+    return {
+        "format": "scanloom map 1",
+        "name": name,
+        "version": 1,
+        "parent": None,
+        "frame": index.frame,
+        "crs": index.georeference,
+        "epsg": index.georeference["epsg"] if index.georeference else None,
+        "origin": index.georeference,
+        "bounds_m": {"min": bounds[0].tolist(), "max": bounds[1].tolist()},
+        "points": int(index.points.sum()),
+        "tile_size_m": index.tile_size_m,
+        "voxel_size_m": index.voxel_size_m,
+        "sessions": sessions,
+        "session_artifacts": keys,
+    }
+
+
+def _digest(source: Path | bytes) -> tuple[str, int]:
+    if isinstance(source, bytes):
+        return hashlib.sha256(source).hexdigest(), len(source)
+    with source.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest(), source.stat().st_size
+
+
+def _same_size(path: Path, size: int) -> bool:
+    try:
+        return path.stat().st_size == size
+    except OSError:
+        return False
+
+
+def place(source: Path | bytes, target: Path) -> None:
+    """Write beside the target, then rename: a reader never sees half a file."""
+    part = target.with_name(f".{target.name}.part")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if isinstance(source, bytes):
+            part.write_bytes(source)
+        else:
+            shutil.copyfile(source, part)
+        os.replace(part, target)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise StoreError(
+            f"cannot be written: {error.strerror}",
+            where=str(target),
+            next_step="free space or fix the permissions, then run the same command again",
+        ) from error

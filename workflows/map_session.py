@@ -1,0 +1,46 @@
+"""From logs to a tiled, georeferenced map: the whole flow, one line a stage."""
+
+from __future__ import annotations
+
+from scanloom.pipeline.node import Node, node
+from scanloom.schemas.evaluation import ErrorTrack, Metrics, ReportFiles
+from scanloom.schemas.loops import Loops, Places
+from scanloom.schemas.pose_graph import Graph
+from scanloom.schemas.scans import Deskewed, Labels, Scans
+from scanloom.schemas.session import RawLog, Session, TruthLog
+from scanloom.schemas.tiles import MapFiles, Piece, Tile, TileFiles, TileIndex
+from scanloom.schemas.tracks import Gnss, Imu, Wheel
+from scanloom.schemas.trajectory import Odometry, Poses, Truth
+from scanloom.stages.denoise import denoise
+from scanloom.stages.deskew import deskew
+from scanloom.stages.evaluation import evaluation
+from scanloom.stages.fusion import fusion
+from scanloom.stages.ingest import ingest
+from scanloom.stages.loops import loops, places
+from scanloom.stages.odometry import odometry
+from scanloom.stages.report import report
+from scanloom.stages.simulate import simulate
+from scanloom.stages.tiling import overview, tiles, tiling
+from scanloom.stages.truth import truth
+
+SIMULATED = "simulated"
+"""Tag of a session that the simulator writes instead of a vehicle."""
+
+# fmt: off
+NODES: tuple[Node, ...] = (
+    node("simulate",   simulate,   per="session", reads=(),                                    writes=(RawLog, TruthLog), only=SIMULATED),
+    node("truth",      truth,      per="session", reads=(TruthLog,),                           writes=Truth),
+    node("ingest",     ingest,     per="session", reads=(RawLog,),                             writes=(Scans, Imu, Gnss, Wheel, Session)),
+    node("deskew",     deskew,     per="chunk",   reads=(Scans, Session, Imu, Wheel),          writes=Deskewed),
+    node("denoise",    denoise,    per="chunk",   reads=(Deskewed, Session),                   writes=Labels),
+    node("odometry",   odometry,   per="session", reads=(Deskewed, Labels, Session, Imu, Wheel), writes=Odometry),
+    node("places",     places,     per="session", reads=(Deskewed, Labels, Odometry),          writes=Places),
+    node("loops",      loops,      per="map",     reads=(Deskewed, Labels, Odometry, Places),  writes=Loops),
+    node("fusion",     fusion,     per="map",     reads=(Session, Odometry, Loops, Gnss, Imu), writes=(Poses, Graph)),
+    node("tiling",     tiling,     per="chunk",   reads=(Deskewed, Labels, Poses),             writes=Piece),
+    node("tiles",      tiles,      per="tile",    reads=(Piece,),                              writes=(Tile, TileFiles)),
+    node("overview",   overview,   per="map",     reads=(Tile,),                               writes=(TileIndex, MapFiles)),
+    node("evaluation", evaluation, per="map",     reads=(Session, Truth, Odometry, Poses, Loops, Tile), writes=(Metrics, ErrorTrack)),
+    node("report",     report,     per="map",     reads=(Session, Metrics, ErrorTrack, Poses, Loops, TileIndex, Tile, Gnss), writes=ReportFiles),
+)
+# fmt: on
