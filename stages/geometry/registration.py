@@ -1,0 +1,231 @@
+"""Registration of a scan to a local map: robust point-to-plane Gauss-Newton on SE(3).
+
+Residual of a point p (LiDAR frame) against the surface (mean m, normal n) at its nearest map point:
+e = n . (T p - m). With T <- T Exp(xi), xi = (rotation, translation), and u = R^T n: de/dxi = (p x u, u).
+The robust weight is Geman-McClure's, w = (k^2 / (k^2 + e^2))^2, as in KISS-ICP (arXiv 2209.15397).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scanloom.stages.geometry.kernels import kernel
+from scanloom.stages.geometry.se3 import F8, se3_exp
+from scanloom.stages.geometry.voxel_map import F4, I4, I8, STEPS, VoxelMap, fit_surface, nearest
+from scanloom.stages.geometry.voxels import unpack
+
+__all__ = ["Registration", "VoxelMap", "align"]
+
+ROTATION_STEP_RAD = 2e-5
+TRANSLATION_STEP_M = 5e-4
+INNER_STEPS = 3
+MIN_MATCHES = 20
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Result of `align`.
+
+    Attributes
+    ----------
+    T_target_source : (4, 4) pose of the source in the target.
+    information : (6, 6) H = sum w J^T J at the solution, order (rotation, translation), right tangent, unscaled:
+        the covariance of a well-conditioned result is sigma2 * inv(H).
+    rmse_m : root mean square residual of the inliers, m; NaN without inliers.
+    inlier_ratio : share of source points whose partner's surface is nearer than the scale of the robust kernel.
+    converged : the last step was below the tolerance and there were enough partners.
+    iterations : searches for partners that were made.
+    sigma2 : sum w e^2 / (sum w - 6), m2 (methods 1.7).
+    points, normals : (k, 3) matched source points and their partners' normals, both in the source frame.
+    weights : (k,) of these residuals.
+    """
+
+    T_target_source: F8
+    information: F8
+    rmse_m: float
+    inlier_ratio: float
+    converged: bool
+    iterations: int
+    sigma2: float
+    points: F8
+    normals: F8
+    weights: F8
+
+
+def align(
+    target: VoxelMap,
+    source: ArrayLike,
+    T_target_source: ArrayLike,
+    *,
+    max_distance_m: float,
+    scale_m: float,
+    max_iterations: int = 20,
+) -> Registration:
+    """Move `source` (n, 3), m, from the initial pose (4, 4) onto the surfaces of `target`.
+
+    Parameters
+    ----------
+    max_distance_m : a point farther than this from every map point has no partner; at most one voxel is looked at.
+    scale_m : residual at which the robust weight falls to a quarter.
+
+    Few partners give `converged=False` and the best pose so far; nothing is raised.
+    """
+    points = np.ascontiguousarray(source, dtype=np.float64).reshape(-1, 3)
+    T = np.array(T_target_source, dtype=np.float64)
+    partner = _Partners(len(points))
+    converged, iterations = False, 0
+    H, residual = np.zeros((6, 6)), _Residuals()
+    while iterations < max_iterations and not converged:
+        iterations += 1
+        partner.search(target, points, T, max_distance_m)
+        start = T
+        for _ in range(INNER_STEPS):
+            H, b, residual = partner.linearise(points, T, scale_m)
+            if residual.matches < MIN_MATCHES:
+                break
+            step = np.linalg.lstsq(H, -b, rcond=1e-12)[0]
+            T = T @ se3_exp(step)
+            if _small(step):
+                break
+        converged = residual.matches >= MIN_MATCHES and _close(start, T)
+    H, _, residual = partner.linearise(points, T, scale_m)
+    return _result(T, H, residual, partner, points, converged, iterations)
+
+
+@dataclass(frozen=True)
+class _Residuals:
+    matches: int = 0
+    weight: float = 0.0
+    weighted_square: float = 0.0
+    inliers: int = 0
+    inlier_square: float = 0.0
+
+
+class _Partners:
+    """For each source point: mean and direction of its partner's surface in the target, and the weight of its shape."""
+
+    def __init__(self, n: int) -> None:
+        self.mean = np.zeros((n, 3))
+        self.normal = np.zeros((n, 3))
+        self.shape = np.zeros(n)
+        self.weight = np.zeros(n)
+
+    def search(self, target: VoxelMap, points: F8, T: F8, max_distance_m: float) -> None:
+        _search(
+            points, T, min(max_distance_m, target.voxel_size_m) ** 2, target.surface_radius_m**2, target.voxel_size_m,
+            target.inserts, target.refit_after, STEPS, target.keys, target.values, target.voxel_key, target.count,
+            target.offset, target.surface, target.fitted, self.mean, self.normal, self.shape,
+        )  # fmt: skip
+
+    def linearise(self, points: F8, T: F8, scale_m: float) -> tuple[F8, F8, _Residuals]:
+        H, b = np.zeros((6, 6)), np.zeros(6)
+        sums = _linearise(points, T, scale_m**2, self.mean, self.normal, self.shape, H, b, self.weight)
+        return H, b, _Residuals(*sums)
+
+
+def _small(step: F8) -> bool:
+    return bool(
+        np.linalg.norm(step[:3]) < ROTATION_STEP_RAD and np.linalg.norm(step[3:]) < TRANSLATION_STEP_M
+    )
+
+
+def _close(a: F8, b: F8) -> bool:
+    turn = a[:3, :3].T @ b[:3, :3]
+    w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    return bool(
+        np.linalg.norm(w) < ROTATION_STEP_RAD and np.linalg.norm(a[:3, 3] - b[:3, 3]) < TRANSLATION_STEP_M
+    )
+
+
+def _result(
+    T: F8, H: F8, residual: _Residuals, partner: _Partners, points: F8, converged: bool, iterations: int
+) -> Registration:
+    matched = partner.shape > 0
+    freedom = residual.weight - 6
+    return Registration(
+        T_target_source=T,
+        information=H,
+        rmse_m=float(np.sqrt(residual.inlier_square / residual.inliers))
+        if residual.inliers
+        else float("nan"),
+        inlier_ratio=residual.inliers / max(len(points), 1),
+        converged=converged,
+        iterations=iterations,
+        sigma2=residual.weighted_square / freedom if freedom > 0 else float("inf"),
+        points=points[matched],
+        normals=partner.normal[matched] @ T[:3, :3],
+        weights=partner.weight[matched],
+    )
+
+
+@kernel
+def _search(
+    points: F8, T: F8, limit2: float, radius2: float, size: float, inserts: int, refit_after: int, steps: I8,
+    keys: I8, values: I4, voxel_key: I8, count: I4, offset: F4, surface: F4, fitted: I4,
+    mean: F8, normal: F8, shape: F8,
+) -> None:  # fmt: skip
+    a, vectors = np.empty((3, 3)), np.empty((3, 3))
+    for n in range(len(points)):
+        px, py, pz = points[n, 0], points[n, 1], points[n, 2]
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        v, c, _ = nearest(x, y, z, limit2, size, steps, keys, values, count, offset)
+        if v < 0:
+            shape[n] = 0.0
+            continue
+        if inserts - fitted[v, c] > refit_after:
+            fit_surface(
+                v, c, radius2, size, steps, keys, values, count, offset, voxel_key, surface, a, vectors
+            )
+            fitted[v, c] = inserts
+        i, j, k = unpack(voxel_key[v])
+        mean[n, 0] = i * size + surface[v, c, 0]
+        mean[n, 1] = j * size + surface[v, c, 1]
+        mean[n, 2] = k * size + surface[v, c, 2]
+        for r in range(3):
+            normal[n, r] = surface[v, c, 3 + r]
+        shape[n] = surface[v, c, 9]
+
+
+@kernel
+def _linearise(
+    points: F8, T: F8, scale2: float, mean: F8, normal: F8, shape: F8, H: F8, b: F8, weight: F8
+) -> tuple[int, float, float, int, float]:
+    J = np.empty(6)
+    matches, inliers = 0, 0
+    total = square = inlier_square = 0.0
+    for n in range(len(points)):
+        weight[n] = 0.0
+        if shape[n] <= 0.0:
+            continue
+        px, py, pz = points[n, 0], points[n, 1], points[n, 2]
+        nx, ny, nz = normal[n, 0], normal[n, 1], normal[n, 2]
+        e = nx * (T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3] - mean[n, 0])
+        e += ny * (T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3] - mean[n, 1])
+        e += nz * (T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3] - mean[n, 2])
+        ux = T[0, 0] * nx + T[1, 0] * ny + T[2, 0] * nz
+        uy = T[0, 1] * nx + T[1, 1] * ny + T[2, 1] * nz
+        uz = T[0, 2] * nx + T[1, 2] * ny + T[2, 2] * nz
+        J[0], J[1], J[2] = py * uz - pz * uy, pz * ux - px * uz, px * uy - py * ux
+        J[3], J[4], J[5] = ux, uy, uz
+        robust = scale2 / (scale2 + e * e)
+        w = robust * robust * shape[n]
+        weight[n] = w
+        matches += 1
+        total += w
+        square += w * e * e
+        if e * e <= scale2:
+            inliers += 1
+            inlier_square += e * e
+        for r in range(6):
+            b[r] += w * J[r] * e
+            for s in range(r, 6):
+                H[r, s] += w * J[r] * J[s]
+    for r in range(6):
+        for s in range(r):
+            H[r, s] = H[s, r]
+    return matches, total, square, inliers, inlier_square

@@ -1,0 +1,300 @@
+"""A local map of points in voxels, with the surface through each point fitted when it is first asked for.
+
+Each voxel keeps at most `points_per_voxel` points that are no closer than a spacing (as KISS-ICP, arXiv 2209.15397).
+The surface through a stored point is the mean and normal of all stored points around it; it is fitted on demand,
+kept, and fitted again once the map has grown by a few scans. Points are float32 from their voxel's corner.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scanloom.stages.geometry.kernels import kernel
+from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.surfaces import eigen_symmetric_3
+from scanloom.stages.geometry.voxels import EMPTY, find_slot, pack, table_length, unpack
+
+F4 = NDArray[np.float32]
+I4 = NDArray[np.int32]
+I8 = NDArray[np.int64]
+
+FIRST_CAPACITY = 2048
+UNFITTED = -1_000_000
+SURFACE_COLUMNS = 11
+"""mean (3) from the voxel's corner, first direction (3), second direction (3), their weights (2)."""
+
+
+class VoxelMap:
+    """Points (n, 3) of one frame in voxels of edge `voxel_size_m`.
+
+    Parameters
+    ----------
+    voxel_size_m : edge of a voxel; also the farthest a neighbour is looked for.
+    points_per_voxel : most points kept in a voxel; they keep a spacing of `voxel_size_m / sqrt(points_per_voxel)`.
+    surface_radius_m : neighbours within it define the surface at a point; 0.75 voxels unless given.
+    refit_after : surfaces are fitted again after this many calls of `insert`.
+    """
+
+    def __init__(
+        self,
+        voxel_size_m: float,
+        points_per_voxel: int = 20,
+        *,
+        surface_radius_m: float | None = None,
+        refit_after: int = 5,
+    ) -> None:
+        self.voxel_size_m = float(voxel_size_m)
+        self.points_per_voxel = int(points_per_voxel)
+        self.spacing_m = self.voxel_size_m / float(np.sqrt(points_per_voxel))
+        self.surface_radius_m = min(surface_radius_m or 0.75 * self.voxel_size_m, self.voxel_size_m)
+        self.refit_after = refit_after
+        self.inserts = 0
+        self.voxels = 0
+        self.keys: I8 = np.full(table_length(FIRST_CAPACITY), EMPTY, np.int64)
+        self.values: I4 = np.zeros(len(self.keys), np.int32)
+        self.voxel_key, self.count, self.offset, self.surface, self.fitted = self._blank(FIRST_CAPACITY)
+
+    def __len__(self) -> int:
+        """Number of points."""
+        return int(self.count[: self.voxels].sum())
+
+    def insert(self, points_world: ArrayLike) -> int:
+        """Add points (n, 3), m; those too close to stored ones, or not finite, are passed over. Returns how many stay."""
+        points = np.ascontiguousarray(points_world, dtype=np.float64).reshape(-1, 3)
+        points = points[np.isfinite(points).all(axis=1)]
+        self.inserts += 1
+        self._reserve(self.voxels + len(points))
+        self.voxels, added = _insert(
+            points, self.voxel_size_m, self.spacing_m**2,
+            self.keys, self.values, self.voxel_key, self.count, self.offset, self.fitted, self.voxels,
+        )  # fmt: skip
+        return int(added)
+
+    def points(self) -> F8:
+        """All points (n, 3), m, voxel by voxel in the order they came."""
+        filled = np.arange(self.points_per_voxel) < self.count[: self.voxels, None]
+        return (self._corners()[:, None, :] + self.offset[: self.voxels])[filled]
+
+    def drop_far(self, center: ArrayLike, radius_m: float) -> None:
+        """Forget voxels whose corner is farther than `radius_m` from `center` (3,)."""
+        distance = np.linalg.norm(self._corners() - np.asarray(center, float), axis=1)
+        kept = np.flatnonzero(distance <= radius_m)
+        if len(kept) == self.voxels:
+            return
+        self._keep(
+            kept,
+            max(
+                FIRST_CAPACITY,
+                len(self.voxel_key) // 2 if 4 * len(kept) < len(self.voxel_key) else len(self.voxel_key),
+            ),
+        )
+
+    def _corners(self) -> F8:
+        return _corners(self.voxel_key[: self.voxels], self.voxel_size_m)
+
+    def _reserve(self, voxels: int) -> None:
+        if voxels > len(self.voxel_key):
+            self._keep(np.arange(self.voxels), max(voxels, 2 * len(self.voxel_key)))
+
+    def _keep(self, kept: I8, capacity: int) -> None:
+        """Move the kept voxels into arrays of the given capacity and rebuild the table."""
+        old = (self.voxel_key, self.count, self.offset, self.surface, self.fitted)
+        new = self._blank(capacity)
+        for source, target in zip(old, new, strict=True):
+            target[: len(kept)] = source[kept]
+        self.voxel_key, self.count, self.offset, self.surface, self.fitted = new
+        self.voxels = len(kept)
+        self.keys = np.full(table_length(capacity), EMPTY, np.int64)
+        self.values = np.zeros(len(self.keys), np.int32)
+        _index(self.voxel_key, self.voxels, self.keys, self.values)
+
+    def _blank(self, capacity: int) -> tuple[I8, I4, F4, F4, I4]:
+        each = self.points_per_voxel
+        return (
+            np.zeros(capacity, np.int64),
+            np.zeros(capacity, np.int32),
+            np.zeros((capacity, each, 3), np.float32),
+            np.zeros((capacity, each, SURFACE_COLUMNS), np.float32),
+            np.full((capacity, each), UNFITTED, np.int32),
+        )
+
+
+def neighbour_steps() -> I8:
+    """The 27 voxels around and including the middle one (27, 3), nearest first."""
+    axis = np.arange(-1, 2)
+    steps = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    return steps[np.argsort((steps**2).sum(axis=1), kind="stable")].astype(np.int64)
+
+
+STEPS = neighbour_steps()
+
+
+@kernel
+def _corners(keys: I8, size: float) -> F8:
+    out = np.empty((len(keys), 3))
+    for n in range(len(keys)):
+        i, j, k = unpack(keys[n])
+        out[n, 0], out[n, 1], out[n, 2] = i * size, j * size, k * size
+    return out
+
+
+@kernel
+def _index(voxel_key: I8, voxels: int, keys: I8, values: I4) -> None:
+    for v in range(voxels):
+        slot = find_slot(keys, voxel_key[v])
+        keys[slot] = voxel_key[v]
+        values[slot] = v
+
+
+@kernel
+def _insert(
+    points: F8, size: float, spacing2: float, keys: I8, values: I4, voxel_key: I8, count: I4, offset: F4, fitted: I4,
+    voxels: int,
+) -> tuple[int, int]:  # fmt: skip
+    most = offset.shape[1]
+    added = 0
+    for n in range(len(points)):
+        i = np.int64(np.floor(points[n, 0] / size))
+        j = np.int64(np.floor(points[n, 1] / size))
+        k = np.int64(np.floor(points[n, 2] / size))
+        key = pack(i, j, k)
+        slot = find_slot(keys, key)
+        if keys[slot] == EMPTY:
+            keys[slot] = key
+            values[slot] = voxels
+            voxel_key[voxels] = key
+            count[voxels] = 0
+            voxels += 1
+        v = values[slot]
+        if count[v] >= most:
+            continue
+        x = np.float32(points[n, 0] - i * size)
+        y = np.float32(points[n, 1] - j * size)
+        z = np.float32(points[n, 2] - k * size)
+        if _crowded(offset, v, count[v], x, y, z, spacing2):
+            continue
+        c = count[v]
+        offset[v, c, 0], offset[v, c, 1], offset[v, c, 2] = x, y, z
+        fitted[v, c] = UNFITTED
+        count[v] = c + 1
+        added += 1
+    return voxels, added
+
+
+@kernel
+def _crowded(offset: F4, v: int, count: int, x: float, y: float, z: float, spacing2: float) -> bool:
+    for c in range(count):
+        dx, dy, dz = offset[v, c, 0] - x, offset[v, c, 1] - y, offset[v, c, 2] - z
+        if dx * dx + dy * dy + dz * dz < spacing2:
+            return True
+    return False
+
+
+@kernel
+def nearest(
+    x: float,
+    y: float,
+    z: float,
+    limit2: float,
+    size: float,
+    steps: I8,
+    keys: I8,
+    values: I4,
+    count: I4,
+    offset: F4,
+) -> tuple[int, int, float]:
+    """Voxel, place in it and squared distance of the stored point nearest to (x, y, z); voxel -1 beyond `limit2`.
+
+    Looks into the 27 voxels around, and skips those that cannot hold a nearer point.
+    """
+    i, j, k = np.int64(np.floor(x / size)), np.int64(np.floor(y / size)), np.int64(np.floor(z / size))
+    fx, fy, fz = x - i * size, y - j * size, z - k * size
+    best, best_v, best_c = limit2, -1, -1
+    for s in range(27):
+        di, dj, dk = steps[s, 0], steps[s, 1], steps[s, 2]
+        if _gap2(fx, di, size) + _gap2(fy, dj, size) + _gap2(fz, dk, size) >= best:
+            continue
+        slot = find_slot(keys, pack(i + di, j + dj, k + dk))
+        if keys[slot] == EMPTY:
+            continue
+        v = values[slot]
+        px, py, pz = fx - di * size, fy - dj * size, fz - dk * size
+        for c in range(count[v]):
+            dx, dy, dz = offset[v, c, 0] - px, offset[v, c, 1] - py, offset[v, c, 2] - pz
+            d2 = dx * dx + dy * dy + dz * dz
+            if d2 < best:
+                best, best_v, best_c = d2, np.int64(v), c
+    return best_v, best_c, best
+
+
+@kernel
+def _gap2(inside: float, step: int, size: float) -> float:
+    """Squared distance along one axis to the neighbouring voxel in direction `step`."""
+    if step == 0:
+        return 0.0
+    gap = size - inside if step > 0 else inside
+    return gap * gap
+
+
+@kernel
+def fit_surface(
+    v: int, c: int, radius2: float, size: float, steps: I8, keys: I8, values: I4, count: I4, offset: F4,
+    voxel_key: I8, surface: F4, a: F8, vectors: F8,
+) -> None:  # fmt: skip
+    """Fit the surface at point c of voxel v to the stored points within the radius; `a`, `vectors` are scratch."""
+    i, j, k = unpack(voxel_key[v])
+    x, y, z = float(offset[v, c, 0]), float(offset[v, c, 1]), float(offset[v, c, 2])
+    a[:] = 0.0
+    sx = sy = sz = 0.0
+    n = 0
+    for s in range(27):
+        di, dj, dk = steps[s, 0], steps[s, 1], steps[s, 2]
+        if _gap2(x, di, size) + _gap2(y, dj, size) + _gap2(z, dk, size) >= radius2:
+            continue
+        slot = find_slot(keys, pack(i + di, j + dj, k + dk))
+        if keys[slot] == EMPTY:
+            continue
+        w = values[slot]
+        px, py, pz = x - di * size, y - dj * size, z - dk * size
+        for m in range(count[w]):
+            dx, dy, dz = offset[w, m, 0] - px, offset[w, m, 1] - py, offset[w, m, 2] - pz
+            if dx * dx + dy * dy + dz * dz > radius2:
+                continue
+            n += 1
+            sx, sy, sz = sx + dx, sy + dy, sz + dz
+            a[0, 0] += dx * dx
+            a[0, 1] += dx * dy
+            a[0, 2] += dx * dz
+            a[1, 1] += dy * dy
+            a[1, 2] += dy * dz
+            a[2, 2] += dz * dz
+    sx, sy, sz = sx / n, sy / n, sz / n
+    a[0, 0] = a[0, 0] / n - sx * sx
+    a[0, 1] = a[1, 0] = a[0, 1] / n - sx * sy
+    a[0, 2] = a[2, 0] = a[0, 2] / n - sx * sz
+    a[1, 1] = a[1, 1] / n - sy * sy
+    a[1, 2] = a[2, 1] = a[1, 2] / n - sy * sz
+    a[2, 2] = a[2, 2] / n - sz * sz
+    eigen_symmetric_3(a, vectors)
+    surface[v, c, 0], surface[v, c, 1], surface[v, c, 2] = x + sx, y + sy, z + sz
+    for r in range(3):
+        surface[v, c, 3 + r] = vectors[r, 0]
+        surface[v, c, 6 + r] = vectors[r, 1]
+    surface[v, c, 9], surface[v, c, 10] = shape_weights(a[0, 0], a[1, 1], a[2, 2], n)
+
+
+MIN_NEIGHBOURS = 6
+SURFACE_NOISE2 = 0.05**2
+
+
+@kernel
+def shape_weights(small: float, middle: float, large: float, n: int) -> tuple[float, float]:
+    """Weights of the residuals along the first and second direction, from the eigenvalues (m2) of n points.
+
+    1 on a clean plane and falling with its roughness; 0 where the points are too few or form a line, since a line of
+    returns on a plane (one beam's ring) says nothing about the direction across it.
+    """
+    if n < MIN_NEIGHBOURS or middle < 0.005 * large or small > 0.2 * middle:
+        return 0.0, 0.0
+    return SURFACE_NOISE2 / (SURFACE_NOISE2 + max(small, 0.0)), 0.0
