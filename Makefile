@@ -7,7 +7,7 @@ ARGS ?=
 PY := .venv/bin/python
 PACKAGES := schemas stages pipeline workflows
 
-.PHONY: help setup setup-dev map test check format lock nightly clean
+.PHONY: help setup setup-dev map test check format lock nightly docs clean
 
 help:
 	@echo "make map [SESSION=log] [OUT=folder] [ARGS='--set odometry.voxel_size_m=0.4']   logs into a map"
@@ -49,3 +49,6 @@ lock:
 
 clean:
 	rm -rf build store maps .venv
+
+docs: setup
+	$(PY) -m scanloom.workflows.reference docs
