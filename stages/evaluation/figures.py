@@ -1,0 +1,42 @@
+"""Figures on their way into `Metrics`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from scanloom.schemas.evaluation import Metrics
+
+Scope = Literal["session", "map"]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One row of `Metrics`."""
+
+    name: str
+    value: float
+    unit: str
+    method: str
+    scope: Scope = "session"
+    session: str = ""
+
+
+def to_metrics(figures: Iterable[Figure]) -> Metrics:
+    """All figures as a table, in the order given; those that are not finite are left out."""
+    rows = [figure for figure in figures if np.isfinite(figure.value)]
+
+    def strings(name: str) -> np.ndarray:
+        return np.array([getattr(row, name) for row in rows], object)
+
+    return Metrics(
+        name=strings("name"),
+        value=np.array([row.value for row in rows], float),
+        unit=strings("unit"),
+        scope=strings("scope"),
+        session=strings("session"),
+        method=strings("method"),
+    )

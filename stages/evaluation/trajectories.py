@@ -1,0 +1,93 @@
+"""Odometry and the map's poses of one session against truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.schemas.evaluation import ErrorTrack
+from scanloom.schemas.trajectory import Odometry, Poses, Truth
+from scanloom.stages.evaluation.figures import Figure
+from scanloom.stages.geometry import alignment
+from scanloom.stages.geometry.interpolation import inside, interpolate_poses
+from scanloom.stages.geometry.se3 import F8
+
+RPE_LENGTHS_M = (1, 5, 10, 20)
+
+
+def trajectory_figures(odometry: Odometry, poses: Poses) -> Iterator[Figure]:
+    """What can be said of a session without truth."""
+    yield Figure("odometry.scans", len(odometry), "", "scans with a pose from odometry")
+    unreliable = int(np.count_nonzero(~odometry.reliable))
+    yield Figure("odometry.unreliable_scans", unreliable, "", "scans whose motion was bridged by prediction")
+    for name, T in (("odometry", odometry.T_odom_lidar), ("fusion", poses.T_world_lidar)):
+        if len(T):
+            length = float(alignment.travelled(T)[-1])
+            yield Figure(f"{name}.path_length_m", length, "m", "sum of the distances from scan to scan")
+
+
+def truth_figures(truth: Truth, odometry: Odometry, poses: Poses) -> Iterator[Figure]:
+    """Errors against truth; truth is interpolated to the scans, scans outside its time range are left out."""
+    for name, stamp_ns, T in _estimates(odometry, poses):
+        covered = inside(truth.stamp_ns, stamp_ns)
+        if np.count_nonzero(covered) < 2:
+            continue
+        true = interpolate_poses(truth.stamp_ns, truth.T_truth_lidar, stamp_ns[covered])
+        if name == "fusion":
+            yield from _coverage(true, covered, truth.source)
+        yield from _error_figures(name, true, T[covered])
+
+
+def error_track(truth: Truth, odometry: Odometry, poses: Poses) -> ErrorTrack | None:
+    """Errors scan by scan where odometry, map and truth all have the scan; None without such scans."""
+    _, at_odometry, at_poses = np.intersect1d(odometry.scan_index, poses.scan_index, return_indices=True)
+    stamp_ns = odometry.stamp_ns[at_odometry]
+    covered = inside(truth.stamp_ns, stamp_ns)
+    if not covered.any():
+        return None
+    true = interpolate_poses(truth.stamp_ns, truth.T_truth_lidar, stamp_ns[covered])
+    return ErrorTrack(
+        stamp_ns=stamp_ns[covered],
+        travelled_m=alignment.travelled(true),
+        odometry_error_m=alignment.errors_from_start(true, odometry.T_odom_lidar[at_odometry][covered]),
+        fusion_error_m=alignment.absolute_errors(true, poses.T_world_lidar[at_poses][covered]),
+    )
+
+
+def _estimates(odometry: Odometry, poses: Poses) -> Iterator[tuple[str, NDArray[np.int64], F8]]:
+    yield "odometry", odometry.stamp_ns, odometry.T_odom_lidar
+    yield "fusion", poses.stamp_ns, poses.T_world_lidar
+
+
+def _coverage(true: F8, covered: NDArray[np.bool_], source: str) -> Iterator[Figure]:
+    length = float(alignment.travelled(true)[-1])
+    method = f"sum of the distances from scan to scan; truth: {source or 'of unnamed origin'}"
+    if length < alignment.KITTI_LENGTHS_M[0]:
+        method += "; KITTI t_rel and r_rel need segments of 100 m and are left out"
+    yield Figure("truth.path_length_m", length, "m", method)
+    yield Figure("truth.scans", int(covered.sum()), "", "scans within the time range of truth")
+    yield Figure(
+        "truth.scans_outside", int((~covered).sum()), "", "scans outside the time range of truth, left out"
+    )
+
+
+def _error_figures(name: str, true: F8, estimate: F8) -> Iterator[Figure]:
+    errors = alignment.absolute_errors(true, estimate)
+    how = "distance to truth after one rigid alignment of all positions (Umeyama, no scale)"
+    yield Figure(f"{name}.ate_rmse_m", alignment.rms(errors), "m", f"root mean square {how}")
+    yield Figure(f"{name}.ate_max_m", float(errors.max()), "m", f"largest {how}")
+    for length in RPE_LENGTHS_M:
+        relative = alignment.relative_errors(true, estimate, float(length))
+        if len(relative):
+            how = f"root mean square error of the motion over {length} m of path, from every scan"
+            yield Figure(f"{name}.rpe{length}_m", alignment.rms(relative.translation_m), "m", how)
+            yield Figure(
+                f"{name}.rpe{length}_deg", alignment.rms(np.degrees(relative.rotation_rad)), "deg", how
+            )
+    kitti = alignment.kitti_errors(true, estimate)
+    if kitti:
+        how = f"KITTI odometry benchmark: mean over {kitti.segments} segments of 100 to 800 m from every tenth scan"
+        yield Figure(f"{name}.kitti_t_rel_percent", kitti.t_rel_percent, "%", how)
+        yield Figure(f"{name}.kitti_r_rel_deg_per_100m", kitti.r_rel_deg_per_100m, "deg/100m", how)
