@@ -113,7 +113,8 @@ class MotionTrack:
 
     def relative(self, a_ns: int, b_ns: int, twist: F8 | None = None) -> F8:
         """T_a_b (4, 4) of the LiDAR between two times; `twist` as for `poses`."""
-        return self.poses(np.array([b_ns]), a_ns, twist)[0]
+        T_a_b: F8 = self.poses(np.array([b_ns]), a_ns, twist)[0]
+        return T_a_b
 
     def poses(self, at_ns: I8, reference_ns: int, twist: F8 | None = None) -> F8:
         """T_reference_t (m, 4, 4) of the LiDAR at the times `at_ns` (m,), in any order.

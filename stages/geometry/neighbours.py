@@ -1,0 +1,118 @@
+"""Motion from the scans themselves: how the LiDAR moved between two neighbouring scans, for logs without sensors.
+
+Both scans are thinned, compensated with the motion guessed so far, and registered; the result is the next guess.
+Two scans distorted alike fit each other well, so the first result is near the truth and the loop ends soon.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.schemas.scans import Scan
+from scanloom.stages.geometry.compensation import compensate
+from scanloom.stages.geometry.motion import MotionTrack
+from scanloom.stages.geometry.registration import Registration, VoxelMap, align
+from scanloom.stages.geometry.se3 import F8, se3_log
+from scanloom.stages.geometry.voxels import downsample
+
+VOXEL_M = 1.0
+POINTS_PER_VOXEL = 20
+TARGET_SPACING_M = 0.3
+SOURCE_SPACING_M = 1.0
+TARGET_POINTS = 40_000
+SOURCE_POINTS = 1500
+COARSE_SCALE_M = 0.5
+FINE_SCALE_M = 0.15
+MOST_PASSES = 4
+SETTLED_M_S = 0.3  # 15 mm over half a sweep of 0.1 s
+SETTLED_RAD_S = 0.02  # 0.06 deg over half a sweep of 0.1 s
+LEAST_INLIERS = 100
+LEAST_INLIER_SHARE = 0.6  # of the points that have a partner; scans that do not belong together reach 0.4
+LONGEST_PAUSE_S = 0.5
+FASTEST_M_S = 70.0
+FASTEST_RAD_S = 12.0
+FIRST_SPEEDS_M_S = (0.0, 8.0, 16.0, 24.0, 32.0)
+"""Forward speeds tried when nothing is known yet; the best fit is kept."""
+
+
+@dataclass(frozen=True)
+class ThinScan:
+    """A few points of a scan with their stamps: `dense` ones to be a target, `sparse` ones to be a source."""
+
+    reference_ns: int
+    dense: Scan
+    sparse: Scan
+
+    @classmethod
+    def of(cls, scan: Scan) -> ThinScan:
+        stride = max(1, len(scan) // TARGET_POINTS) | 1  # odd, so that no beam of an even number is left out
+        some = scan.take(slice(None, None, stride))
+        points = some.points()
+        dense = downsample(points, TARGET_SPACING_M)
+        sparse = dense[downsample(points[dense], SOURCE_SPACING_M)]
+        fewer = sparse[:: max(1, -(-len(sparse) // SOURCE_POINTS))]
+        return cls(scan.reference_ns, some.take(dense), some.take(fewer))
+
+
+def twist_between(a: ThinScan, b: ThinScan, track: MotionTrack, guess: F8 | None) -> F8 | None:
+    """Twist (6,) of the LiDAR from scan a to scan b, (rad/s, m/s) in its own frame, or None when they do not fit.
+
+    guess : twist of the pair before, if any. Rotation and translation that `track` covers are used as they are.
+    """
+    pause_s = (b.reference_ns - a.reference_ns) * 1e-9
+    if not 0 < pause_s < LONGEST_PAUSE_S or min(len(a.sparse), len(b.sparse)) < 100:
+        return None
+    twist = guess if guess is not None else _first_guess(a, b, track)
+    for _ in range(MOST_PASSES):
+        found = _register(a, b, track, twist, FINE_SCALE_M, 8)
+        if not _fits(found, len(b.sparse)):
+            return None
+        before, twist = twist, se3_log(found.T_target_source) / pause_s
+        if _settled(twist - before):
+            break
+    return twist if _plausible(twist) else None
+
+
+def _first_guess(a: ThinScan, b: ThinScan, track: MotionTrack) -> F8:
+    """The best of several forward speeds, each refined by one coarse registration."""
+    forward = track.T_base_lidar[0, :3]  # x of the base in the LiDAR frame
+    pause_s = (b.reference_ns - a.reference_ns) * 1e-9
+    best, best_twist = -1.0, np.zeros(6)
+    for speed in FIRST_SPEEDS_M_S:
+        found = _register(a, b, track, np.concatenate((np.zeros(3), speed * forward)), COARSE_SCALE_M, 15)
+        fit = found.inlier_ratio / (1e-3 + np.nan_to_num(found.rmse_m, nan=1.0))
+        if fit > best:
+            best, best_twist = fit, se3_log(found.T_target_source) / pause_s
+    return best_twist
+
+
+def _register(
+    a: ThinScan, b: ThinScan, track: MotionTrack, twist: F8, scale_m: float, iterations: int
+) -> Registration:
+    target = VoxelMap(VOXEL_M, POINTS_PER_VOXEL)
+    target.insert(_compensated(a.dense, track, twist))
+    return align(
+        target, _compensated(b.sparse, track, twist), track.relative(a.reference_ns, b.reference_ns, twist),
+        max_distance_m=VOXEL_M, scale_m=scale_m, max_iterations=iterations,
+    )  # fmt: skip
+
+
+def _compensated(scan: Scan, track: MotionTrack, twist: F8) -> NDArray[np.float64]:
+    xyz = compensate(scan.stamp_ns, scan.x_m, scan.y_m, scan.z_m, scan.reference_ns, track, twist)
+    return np.column_stack(xyz).astype(np.float64)
+
+
+def _fits(found: Registration, tried: int) -> bool:
+    inliers = found.inlier_ratio * tried
+    return inliers >= LEAST_INLIERS and inliers >= LEAST_INLIER_SHARE * len(found.points)
+
+
+def _settled(change: F8) -> bool:
+    return bool(np.linalg.norm(change[:3]) < SETTLED_RAD_S and np.linalg.norm(change[3:]) < SETTLED_M_S)
+
+
+def _plausible(twist: F8) -> bool:
+    return bool(np.linalg.norm(twist[:3]) < FASTEST_RAD_S and np.linalg.norm(twist[3:]) < FASTEST_M_S)
