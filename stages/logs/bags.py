@@ -1,0 +1,120 @@
+"""A log of one or several container files (rosbag1, rosbag2, MCAP) as one `LogSource`."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.schemas.session import Extrinsic, Problem
+from scanloom.stages.logs.containers import Container
+from scanloom.stages.logs.messages import decode, kind_of, ros2_name
+from scanloom.stages.logs.records import Damage, Message, TopicInfo
+
+_ENCODINGS = ("cdr", "ros1")
+
+
+@dataclass
+class BagLog:
+    """Container files in order of time; topics of the same name are one topic."""
+
+    format: str
+    files: list[Container]
+    problems: tuple[Problem, ...] = ()
+    extrinsics: tuple[Extrinsic, ...] = ()
+    expected_messages: int = 0
+    """Messages that the log's own metadata promises; 0 when it does not tell."""
+    missing_files: tuple[str, ...] = ()
+    topics: tuple[TopicInfo, ...] = ()
+    opening: Damage = field(default_factory=Damage)
+
+    def __post_init__(self) -> None:
+        self.files.sort(key=lambda file: _range(file)[0])
+        self.topics = _topics(self.files)
+
+    @property
+    def damage(self) -> Damage:
+        """What was lost in any of the files so far."""
+        total = Damage(list(self.opening.texts), self.opening.lost_bytes)
+        for file in self.files:
+            total.lost_bytes += file.damage.lost_bytes
+            total.texts += [f"{file.path.name}: {text}" for text in file.damage.texts]
+        return total
+
+    def messages(self, topics: Collection[str]) -> Iterator[Message]:
+        """Decoded messages of the topics in order of receive time."""
+        for group in _groups(self.files):
+            streams = [self._decoded(file, topics) for file in group]
+            merged = streams[0] if len(streams) == 1 else heapq.merge(*streams, key=_receive_ns)
+            for _, message in merged:
+                yield message
+
+    def _decoded(self, file: Container, topics: Collection[str]) -> Iterator[tuple[int, Message]]:
+        channels = file.channels
+        wanted = {
+            number
+            for number, channel in channels.items()
+            if channel.topic in topics
+            and channel.encoding in _ENCODINGS
+            and kind_of(channel.type) not in ("other", "images")
+        }
+        for raw in file.read(wanted):
+            channel = channels[raw.channel]
+            body = decode(raw.data, channel.type, channel.encoding, channel.topic, raw.receive_ns)
+            yield raw.receive_ns, Message(channel.topic, body)
+
+
+def _receive_ns(pair: tuple[int, Message]) -> int:
+    return pair[0]
+
+
+def _range(file: Container) -> tuple[int, int]:
+    stamps = [values for values in file.stamps.values() if len(values)]
+    if not stamps:
+        return 0, 0
+    return min(int(values[0]) for values in stamps), max(int(values[-1]) for values in stamps)
+
+
+def _groups(files: Sequence[Container]) -> Iterator[list[Container]]:
+    """Files that overlap in time are read together, others one after the other."""
+    group: list[Container] = []
+    end_ns = 0
+    for file in files:
+        first, last = _range(file)
+        if group and first > end_ns:
+            yield group
+            group = []
+        group.append(file)
+        end_ns = max(end_ns, last)
+    if group:
+        yield group
+
+
+def _topics(files: Sequence[Container]) -> tuple[TopicInfo, ...]:
+    stamps: dict[str, list[NDArray[np.int64]]] = {}
+    types: dict[str, tuple[str, str]] = {}
+    for file in files:
+        found = file.stamps
+        for number, channel in file.channels.items():
+            types.setdefault(channel.topic, (channel.type, channel.encoding))
+            stamps.setdefault(channel.topic, []).append(found.get(number, np.empty(0, np.int64)))
+    return tuple(
+        _info(topic, *types[topic], np.sort(np.concatenate(parts))) for topic, parts in sorted(stamps.items())
+    )
+
+
+def _info(topic: str, type_name: str, encoding: str, stamps: NDArray[np.int64]) -> TopicInfo:
+    known = encoding in _ENCODINGS
+    return TopicInfo(
+        name=topic,
+        type=ros2_name(type_name),
+        kind=kind_of(type_name) if known else "other",
+        count=len(stamps),
+        first_ns=int(stamps[0]) if len(stamps) else 0,
+        last_ns=int(stamps[-1]) if len(stamps) else 0,
+        period_ns=int(np.median(np.diff(stamps))) if len(stamps) > 1 else 0,
+        remark="" if known else f"encoding {encoding!r} cannot be read",
+    )

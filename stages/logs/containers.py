@@ -1,0 +1,186 @@
+"""What the bag formats have in common: channels, blocks of messages, time order, bounded decompression."""
+
+from __future__ import annotations
+
+import bz2
+import mmap
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.stages.logs.records import Damage
+
+MAX_CHUNK_BYTES = 1 << 30
+"""No recorder writes larger chunks; a file that declares one is damaged or hostile."""
+MAX_MESSAGE_BYTES = 256 << 20
+"""No cloud or image is larger."""
+
+
+class DamageError(Exception):
+    """Part of a container cannot be read; caught inside `stages.logs` and told as damage."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A stream inside one container file."""
+
+    topic: str
+    type: str
+    encoding: str
+    """`cdr`, `ros1`, or what else the file says."""
+
+
+class RawMessage(NamedTuple):
+    """A message still in its bytes, with the number of its channel."""
+
+    receive_ns: int
+    channel: int
+    data: memoryview
+
+
+@dataclass
+class Block:
+    """Messages that are read together: a chunk, or a run of loose messages."""
+
+    start_ns: int
+    offset: int
+    stamps: dict[int, NDArray[np.int64]]
+    """Receive times per channel, as the index tells."""
+
+
+class Container(Protocol):
+    """One file of a log, opened and indexed, its messages not yet read."""
+
+    path: Path
+    damage: Damage
+
+    @property
+    def channels(self) -> dict[int, Channel]: ...
+
+    @property
+    def stamps(self) -> dict[int, NDArray[np.int64]]:
+        """Receive times of all messages, per channel."""
+
+    def read(self, channels: set[int]) -> Iterator[RawMessage]:
+        """Messages of the channels in order of receive time."""
+
+
+def map_file(path: Path) -> memoryview:
+    """The file's bytes without reading them; empty for an empty file."""
+    with path.open("rb") as stream:
+        if path.stat().st_size == 0:
+            return memoryview(b"")
+        return memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+
+
+def in_time_order(blocks: Iterable[tuple[int, Callable[[], list[RawMessage]]]]) -> Iterator[RawMessage]:
+    """Messages of blocks (start time, loader) sorted by start, merged where blocks overlap.
+
+    Only blocks that overlap in time are in memory together.
+    """
+    pending: list[RawMessage] = []
+    for start_ns, load in blocks:
+        cut = _first_at_or_after(pending, start_ns)
+        yield from pending[:cut]
+        pending = pending[cut:]
+        pending.extend(load())
+        pending.sort(key=_time)
+    yield from pending
+
+
+def _time(message: RawMessage) -> int:
+    return message.receive_ns
+
+
+def _first_at_or_after(pending: list[RawMessage], start_ns: int) -> int:
+    for i, message in enumerate(pending):
+        if message.receive_ns >= start_ns:
+            return i
+    return len(pending)
+
+
+def merge_stamps(blocks: Iterable[Block]) -> dict[int, NDArray[np.int64]]:
+    """Receive times per channel over all blocks, sorted."""
+    parts: dict[int, list[NDArray[np.int64]]] = {}
+    for block in blocks:
+        for channel, stamps in block.stamps.items():
+            parts.setdefault(channel, []).append(stamps)
+    return {channel: np.sort(np.concatenate(arrays)) for channel, arrays in parts.items()}
+
+
+@dataclass
+class StampLists:
+    """Collects receive times per channel while messages are walked."""
+
+    lists: dict[int, list[int]] = field(default_factory=dict)
+
+    def add(self, channel: int, stamp_ns: int) -> None:
+        self.lists.setdefault(channel, []).append(stamp_ns)
+
+    def arrays(self) -> dict[int, NDArray[np.int64]]:
+        return {channel: np.array(values, np.int64) for channel, values in self.lists.items()}
+
+
+def decompress(compression: str, data: memoryview, size: int, *, partial: bool = False) -> bytes | memoryview:
+    """Bytes of a chunk. Never makes more than `size` bytes, whatever the compressed data claims.
+
+    With `partial` the data may end early, and what can be had of it is returned.
+
+    Raises
+    ------
+    DamageError : the declared size is not credible, the data is damaged, or of another size than declared.
+    """
+    if size > MAX_CHUNK_BYTES:
+        raise DamageError(f"a chunk claims {size / 2**30:.1f} GiB, more than any recorder writes")
+    if compression in ("", "none"):
+        return data[:size]
+    try:
+        out = _INFLATE[compression](data, size)
+    except KeyError:
+        raise DamageError(f"a chunk is compressed by {compression!r}, which is unknown") from None
+    except DamageError:
+        raise
+    except Exception as error:  # the three libraries have no common base
+        raise DamageError(f"a chunk cannot be decompressed ({error})") from error
+    if len(out) != size and not partial:
+        raise DamageError(f"a chunk has {len(out)} bytes where {size} are declared")
+    return out
+
+
+def _zstd(data: memoryview, size: int) -> bytes:
+    import zstandard
+
+    reader = zstandard.ZstdDecompressor(max_window_size=1 << 30).stream_reader(data)
+    return _bounded(reader.read, size)
+
+
+def _lz4(data: memoryview, size: int) -> bytes:
+    import lz4.frame
+
+    machine = lz4.frame.LZ4FrameDecompressor()
+    out: bytes = machine.decompress(data, max_length=size)
+    return out
+
+
+def _bz2(data: memoryview, size: int) -> bytes:
+    return bz2.BZ2Decompressor().decompress(data, max_length=size)
+
+
+def _bounded(read: Callable[[int], bytes], size: int) -> bytes:
+    """Up to `size` bytes; what was had before the data ends or breaks is kept."""
+    pieces: list[bytes] = []
+    left = size
+    while left > 0:
+        piece = read(min(left, 1 << 24))
+        if not piece:
+            break
+        pieces.append(piece)
+        left -= len(piece)
+    return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+
+
+_INFLATE: dict[str, Callable[[memoryview, int], bytes]] = {"zstd": _zstd, "lz4": _lz4, "bz2": _bz2}

@@ -1,0 +1,250 @@
+"""ROS messages from their bytes: the few types a map needs, in CDR (ROS 2) and in ROS 1 serialization.
+
+Written by hand, because a cloud must not be copied and a damaged message must not raise anything but `ValueError`.
+Sources: OMG CDR (DDSI-RTPS 2.5, section 10), the ROS 1 wiki page "Messages/Serialization", common_interfaces.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scanloom.stages.geometry.se3 import F8, matrix_from_quaternion, pose
+from scanloom.stages.logs.records import (
+    LIVOX_POINT,
+    Body,
+    GnssSample,
+    ImuSample,
+    Kind,
+    LivoxCloud,
+    PointCloud2,
+    PointField,
+    Transform,
+    Transforms,
+    Undecodable,
+    WheelSample,
+)
+
+_MAX_NAME = 4096
+_MAX_ITEMS = 4096
+
+
+class Cursor:
+    """Reads primitives one after the other. Raises ValueError where the bytes end or make no sense."""
+
+    __slots__ = ("_align_max", "_base", "at", "data", "order", "ros1")
+
+    def __init__(self, data: memoryview, encoding: str) -> None:
+        self.data = data
+        self.ros1 = encoding == "ros1"
+        self.order = "<"
+        self.at = self._base = 0
+        self._align_max = 1 if self.ros1 else 8
+        if not self.ros1:
+            if len(data) < 4:
+                raise ValueError("message is empty")
+            # encapsulation: 0/1 CDR big/little endian, 6/7 plain CDR2 (aligned to 4 at most)
+            kind = data[1]
+            if data[0] != 0 or kind not in (0, 1, 6, 7):
+                raise ValueError(f"unknown CDR encapsulation {data[0]:02x}{kind:02x}")
+            self.order = "<" if kind & 1 else ">"
+            self._align_max = 4 if kind > 5 else 8
+            self.at = self._base = 4
+
+    def read(self, code: str, count: int = 1) -> tuple[Any, ...]:
+        """`count` primitives of one struct code, aligned to their own size."""
+        size = struct.calcsize(code)
+        self.align(size)
+        try:
+            values = struct.unpack_from(f"{self.order}{count}{code}", self.data, self.at)
+        except struct.error as error:
+            raise ValueError("message ends early") from error
+        self.at += size * count
+        return values
+
+    def align(self, size: int) -> None:
+        step = min(size, self._align_max)
+        self.at += -(self.at - self._base) % step
+
+    def number(self, code: str) -> Any:
+        return self.read(code)[0]
+
+    def doubles(self, count: int) -> tuple[float, ...]:
+        return self.read("d", count)
+
+    def length(self, limit: int = _MAX_ITEMS) -> int:
+        count = int(self.number("I"))
+        if count > limit:
+            raise ValueError(f"a length of {count} makes no sense here")
+        return count
+
+    def text(self) -> str:
+        raw = self.take(self.length(_MAX_NAME))
+        return bytes(raw).rstrip(b"\0").decode("utf-8", "replace")
+
+    def take(self, count: int) -> memoryview:
+        if self.at + count > len(self.data):
+            raise ValueError("message ends early")
+        piece = self.data[self.at : self.at + count]
+        self.at += count
+        return piece
+
+    def time_ns(self) -> int:
+        seconds, nanoseconds = self.number("I" if self.ros1 else "i"), self.number("I")
+        return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+    def header(self) -> tuple[int, str]:
+        """Stamp in ns and frame, without the leading slash of old tf."""
+        if self.ros1:
+            self.number("I")
+        stamp_ns = self.time_ns()
+        return stamp_ns, self.text().lstrip("/")
+
+
+def _imu(c: Cursor, receive_ns: int) -> Body:
+    stamp_ns, frame = c.header()
+    values = c.doubles(37)
+    gx, gy, gz = values[13:16]
+    ax, ay, az = values[25:28]
+    return ImuSample(stamp_ns, receive_ns, (gx, gy, gz), (ax, ay, az), frame)
+
+
+def _gnss(c: Cursor, receive_ns: int) -> Body:
+    stamp_ns, frame = c.header()
+    status = int(c.number("b"))
+    c.number("H")
+    latitude, longitude, height = c.doubles(3)
+    covariance = c.doubles(9)
+    known = int(c.number("B")) != 0
+    return GnssSample(
+        stamp_ns,
+        receive_ns,
+        latitude,
+        longitude,
+        height,
+        covariance,
+        status,
+        frame_id=frame,
+        covariance_known=known,
+    )
+
+
+def _odometry(c: Cursor, receive_ns: int) -> Body:
+    stamp_ns, frame = c.header()
+    child = c.text().lstrip("/")
+    c.doubles(43)
+    twist = c.doubles(6)
+    return WheelSample(stamp_ns, receive_ns, twist[0], twist[5], child or frame)
+
+
+def _twist(c: Cursor, receive_ns: int) -> Body:
+    stamp_ns, frame = c.header()
+    twist = c.doubles(6)
+    return WheelSample(stamp_ns, receive_ns, twist[0], twist[5], frame)
+
+
+def _tf(c: Cursor, receive_ns: int) -> Body:
+    transforms = tuple(_transform(c) for _ in range(c.length()))
+    stamp_ns = transforms[0].stamp_ns if transforms else receive_ns
+    return Transforms(stamp_ns, receive_ns, transforms, static=False)
+
+
+def _transform(c: Cursor) -> Transform:
+    stamp_ns, parent = c.header()
+    child = c.text().lstrip("/")
+    x, y, z, qx, qy, qz, qw = c.doubles(7)
+    return Transform(stamp_ns, parent, child, _pose(np.array([qw, qx, qy, qz]), np.array([x, y, z])))
+
+
+def _pose(q: F8, t: F8) -> F8:
+    norm = float(np.linalg.norm(q))
+    if not math.isfinite(norm) or abs(norm - 1) > 0.1 or not np.isfinite(t).all():
+        raise ValueError("a transform whose quaternion has not length one")
+    return pose(matrix_from_quaternion(q / norm), t)
+
+
+def _cloud(c: Cursor, receive_ns: int) -> Body:
+    stamp_ns, frame = c.header()
+    height, width = int(c.number("I")), int(c.number("I"))
+    fields = tuple(_field(c) for _ in range(c.length()))
+    bigendian = bool(c.number("B"))
+    point_step, row_step = int(c.number("I")), int(c.number("I"))
+    data = np.frombuffer(c.take(int(c.number("I"))), np.uint8)
+    dense = bool(c.number("B"))
+    return PointCloud2(
+        stamp_ns, receive_ns, frame, height, width, fields, bigendian, point_step, row_step, data, dense
+    )
+
+
+def _field(c: Cursor) -> PointField:
+    name = c.text()
+    return PointField(name, int(c.number("I")), int(c.number("B")), int(c.number("I")))
+
+
+def _livox(c: Cursor, receive_ns: int) -> Body:
+    stamp_ns, frame = c.header()
+    timebase_ns = int(c.number("Q"))
+    c.number("I")
+    c.take(4)
+    count = int(c.number("I"))
+    # CDR aligns every element to 4 bytes, so that the last one alone is 19 bytes long
+    stride = LIVOX_POINT.itemsize if c.ros1 else 20
+    needed = max(count * stride - (stride - LIVOX_POINT.itemsize), 0)
+    raw = bytes(c.take(needed)) + bytes(stride - LIVOX_POINT.itemsize if count else 0)
+    layout = np.dtype(
+        {
+            "names": LIVOX_POINT.names,
+            "formats": [LIVOX_POINT[name].newbyteorder(c.order) for name in LIVOX_POINT.names or ()],
+            "offsets": [LIVOX_POINT.fields[name][1] for name in LIVOX_POINT.names or ()],  # type: ignore[index]
+            "itemsize": stride,
+        }
+    )
+    return LivoxCloud(stamp_ns, receive_ns, frame, timebase_ns, np.frombuffer(raw, layout, count))
+
+
+_DECODERS: dict[str, tuple[Kind, Callable[[Cursor, int], Body]]] = {
+    "sensor_msgs/PointCloud2": ("cloud", _cloud),
+    "livox_ros_driver/CustomMsg": ("cloud", _livox),
+    "livox_ros_driver2/CustomMsg": ("cloud", _livox),
+    "livox_interfaces/CustomMsg": ("cloud", _livox),
+    "sensor_msgs/Imu": ("imu", _imu),
+    "sensor_msgs/NavSatFix": ("gnss", _gnss),
+    "nav_msgs/Odometry": ("wheel", _odometry),
+    "geometry_msgs/TwistStamped": ("wheel", _twist),
+    "geometry_msgs/TwistWithCovarianceStamped": ("wheel", _twist),
+    "tf2_msgs/TFMessage": ("tf", _tf),
+    "tf/tfMessage": ("tf", _tf),
+}
+_IMAGES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage")
+
+
+def ros2_name(type_name: str) -> str:
+    """`sensor_msgs/Imu` as `sensor_msgs/msg/Imu`; names of ROS 2 stay as they are."""
+    package, _, rest = type_name.partition("/")
+    return type_name if not rest or rest.startswith("msg/") else f"{package}/msg/{rest}"
+
+
+def _short(type_name: str) -> str:
+    return type_name.replace("/msg/", "/")
+
+
+def kind_of(type_name: str) -> Kind:
+    """What a topic of this type may be used for."""
+    short = _short(type_name)
+    if short in _DECODERS:
+        return _DECODERS[short][0]
+    return "images" if short in _IMAGES else "other"
+
+
+def decode(data: memoryview, type_name: str, encoding: str, topic: str, receive_ns: int) -> Body:
+    """One message; `encoding` is `cdr` or `ros1`. Bytes that do not fit the type give `Undecodable`."""
+    try:
+        body = _DECODERS[_short(type_name)][1](Cursor(data, encoding), receive_ns)
+    except (ValueError, OverflowError) as error:
+        return Undecodable(receive_ns, receive_ns, str(error))
+    if isinstance(body, Transforms) and topic.rstrip("/").endswith("tf_static"):
+        return Transforms(body.stamp_ns, body.receive_ns, body.transforms, static=True)
+    return body

@@ -1,0 +1,38 @@
+"""Opens any log: one door for ingest and inspect."""
+
+from __future__ import annotations
+
+from scanloom.schemas.errors import InvalidInput
+from scanloom.schemas.session import RawLog
+from scanloom.stages.logs.bags import BagLog
+from scanloom.stages.logs.mcap import McapFile
+from scanloom.stages.logs.records import LogSource
+
+
+def open_log(raw_log: RawLog, rate_hz: float = 10.0) -> LogSource:
+    """Open the log that `locate` found.
+
+    Parameters
+    ----------
+    rate_hz : scan rate of plain folders of scans, which carry no time.
+
+    Raises
+    ------
+    InvalidInput : the files are no log.
+    """
+    from scanloom.stages.logs.formats import detect
+
+    if raw_log.root is None or not raw_log.names:
+        raise InvalidInput(
+            "The log holds no file.", next_step="give a bag, an .mcap file or a folder of scans"
+        )
+    found = detect(raw_log.names)
+    if found.startswith("kitti"):
+        from scanloom.stages.logs.kitti import open_kitti
+
+        return open_kitti(raw_log)
+    if found == "point files":
+        from scanloom.stages.logs.pointfiles import open_point_files
+
+        return open_point_files(raw_log, rate_hz)
+    return BagLog("mcap", [McapFile(raw_log.path(n)) for n in raw_log.names if n.endswith(".mcap")])

@@ -1,0 +1,301 @@
+"""A log on its way through: what every message adds to the picture, and the session that comes out in the end.
+
+Ingest and inspect both feed it, so that what inspect says is what ingest finds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.schemas.session import Extrinsic, Problem, Session, Topic
+from scanloom.schemas.tracks import Gnss, Imu, Wheel
+from scanloom.stages.logs.checks import GRAVITY_M_S2, gnss_problems, imu_problems, stamp_problems
+from scanloom.stages.logs.mounting import TfTree, resolve
+from scanloom.stages.logs.options import Settings
+from scanloom.stages.logs.records import (
+    CloudFile,
+    GnssSample,
+    ImuSample,
+    LivoxCloud,
+    LogSource,
+    Message,
+    PointCloud2,
+    Transforms,
+    Undecodable,
+    WheelSample,
+)
+from scanloom.stages.logs.roles import ROLES, Roles
+
+I8 = NDArray[np.int64]
+PointTime = Literal["per point", "from azimuth", "none"]
+_CLOCK_APART_NS = 1_000_000_000
+
+
+@dataclass
+class _Track:
+    """Stamps of one topic in the order of the log."""
+
+    header_ns: list[int] = field(default_factory=list)
+    receive_ns: list[int] = field(default_factory=list)
+    broken: int = 0
+    broken_reason: str = ""
+    frame: str = ""
+
+    def add(self, header_ns: int, receive_ns: int) -> None:
+        self.header_ns.append(header_ns)
+        self.receive_ns.append(receive_ns)
+
+    def lag_ns(self) -> float:
+        """Median of header minus receive time."""
+        return float(np.median(np.subtract(self.header_ns, self.receive_ns))) if self.header_ns else 0.0
+
+
+@dataclass
+class ScanTally:
+    """What ingest counts while it makes scans."""
+
+    scans: int = 0
+    points: int = 0
+    no_return: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    beams: int = 0
+    point_time: PointTime = "per point"
+    problems: list[Problem] = field(default_factory=list)
+
+
+class Survey:
+    """Takes in the messages of the used topics one by one; clouds are looked at by their headers only."""
+
+    def __init__(self, source: LogSource, roles: Roles, settings: Settings) -> None:
+        self.source, self.roles, self.settings = source, roles, settings
+        self.tf = TfTree()
+        self.tracks = {role: _Track() for role in ROLES}
+        self._role = roles.used()
+        self._imu: list[ImuSample] = []
+        self._gnss: list[GnssSample] = []
+        self._wheel: list[WheelSample] = []
+
+    @property
+    def topics(self) -> set[str]:
+        """Topics that must be read: those in use, and transforms."""
+        return set(self._role) | {topic.name for topic in self.source.topics if topic.kind == "tf"}
+
+    def note(self, message: Message) -> None:
+        """Take in one message."""
+        body = message.body
+        if isinstance(body, Transforms):
+            self.tf.note(body)
+            return
+        role = self._role.get(message.topic)
+        if role is None:
+            return
+        track = self.tracks[role]
+        if isinstance(body, Undecodable):
+            track.broken += 1
+            track.broken_reason = track.broken_reason or body.reason
+            return
+        self._keep(body)
+        track.add(body.stamp_ns, body.receive_ns)
+        track.frame = track.frame or getattr(body, "frame_id", "")
+
+    def _keep(self, body: object) -> None:
+        if isinstance(body, ImuSample):
+            self._imu.append(body)
+        elif isinstance(body, GnssSample):
+            self._gnss.append(body)
+        elif isinstance(body, WheelSample):
+            self._wheel.append(body)
+
+    # -- products -----------------------------------------------------------------------------------------------------
+
+    def imu(self) -> Imu:
+        """All IMU samples in order of time, in SI units."""
+        rows = self._ordered("imu")
+        accel = np.array([s.accel_m_s2 for s in self._imu], float).reshape(-1, 3)[rows]
+        gyro = np.array([s.gyro_rad_s for s in self._imu], float).reshape(-1, 3)[rows]
+        scale = GRAVITY_M_S2 if self._in_g() else 1.0
+        return Imu(stamp_ns=self._stamps("imu")[rows], gyro_rad_s=gyro, accel_m_s2=accel * scale)
+
+    def _in_g(self) -> bool:
+        """Some IMUs (Livox, for one) give acceleration in units of gravity."""
+        accel = np.array([s.accel_m_s2 for s in self._imu], float).reshape(-1, 3)
+        return bool(len(accel) and 0.8 < np.linalg.norm(np.median(accel, axis=0)) < 1.2)
+
+    def gnss(self) -> Gnss:
+        """All fixes in order of time; position NaN where there is none."""
+        rows = self._ordered("gnss")
+        values = np.array([(s.latitude_deg, s.longitude_deg, s.height_m) for s in self._gnss], float).reshape(
+            -1, 3
+        )
+        status = np.array([s.status for s in self._gnss], np.int8)
+        # receivers without fix send zeros
+        lost = (status < 0) | ~np.isfinite(values[:, :2]).all(axis=1) | ~values[:, :2].any(axis=1)
+        values[lost] = np.nan
+        status[lost] = -1
+        covariance = np.array([s.covariance_m2 for s in self._gnss], float).reshape(-1, 3, 3)
+        known = np.array([s.covariance_known for s in self._gnss], bool)
+        covariance[~known] = 0.0
+        return Gnss(
+            stamp_ns=self._stamps("gnss")[rows],
+            latitude_deg=values[rows, 0],
+            longitude_deg=values[rows, 1],
+            height_m=values[rows, 2],
+            covariance_m2=covariance[rows],
+            status=status[rows],
+            satellites=np.array([s.satellites for s in self._gnss], np.int16)[rows],
+        )
+
+    def wheel(self) -> Wheel:
+        """All wheel speeds in order of time."""
+        rows = self._ordered("wheel")
+        values = np.array([(s.speed_m_s, s.yaw_rate_rad_s) for s in self._wheel], float).reshape(-1, 2)[rows]
+        return Wheel(
+            stamp_ns=self._stamps("wheel")[rows],
+            speed_m_s=values[:, 0].copy(),
+            yaw_rate_rad_s=values[:, 1].copy(),
+        )
+
+    def _stamps(self, role: str) -> I8:
+        """Stamps on the LiDAR's clock, in the order of the log."""
+        track = self.tracks[role]
+        receive = self.settings.stamp_source == "receive"
+        stamps = np.array(track.receive_ns if receive else track.header_ns, np.int64)
+        return stamps + self.settings.offset_ns(role) + self._shift_ns(role)
+
+    def _shift_ns(self, role: str) -> int:
+        """What brings a sensor with a clock of its own to the LiDAR's clock, from receive times."""
+        if (
+            not self.settings.align_clocks
+            or self.settings.stamp_source == "receive"
+            or self.settings.offset_ns(role)
+        ):
+            return 0
+        lidar, sensor = self.tracks["lidar"], self.tracks[role]
+        if not lidar.header_ns or not sensor.header_ns:
+            return 0
+        shift = round(lidar.lag_ns() - sensor.lag_ns())
+        return shift if abs(shift) > _CLOCK_APART_NS else 0
+
+    def _ordered(self, role: str) -> I8:
+        """Rows in order of time, the first of equal stamps only."""
+        return np.unique(self._stamps(role), return_index=True)[1].astype(np.int64)
+
+    # -- summary ------------------------------------------------------------------------------------------------------
+
+    def session(self, name: str, tally: ScanTally, imu: Imu, gnss: Gnss) -> Session:
+        """The summary of the log, after its last message."""
+        frames = {role: self.tracks[role].frame for role in ROLES if self.tracks[role].header_ns}
+        extrinsics, assumed = resolve(self.tf, frames, self.settings.mountings(), self.source.extrinsics)
+        lidar = self.roles.lidar
+        period = next((t.period_ns for t in self.source.topics if t.name == lidar), 0)
+        if len(self.tracks["lidar"].header_ns) > 1:
+            period = int(np.median(np.diff(np.unique(self.tracks["lidar"].header_ns))))
+        problems = [
+            *self._damage(),
+            *self.source.problems,
+            *self.roles.problems,
+            *tally.problems,
+            *assumed,
+            *self._sensor_problems(imu, gnss, extrinsics),
+            *self._coverage(tally),
+        ]
+        return Session(
+            name=name,
+            format=self.source.format,
+            start_ns=tally.first_ns,
+            end_ns=tally.last_ns,
+            scan_count=tally.scans,
+            point_count=tally.points,
+            scan_rate_hz=1e9 / period if period else 0.0,
+            beams=tally.beams,
+            point_time=tally.point_time,
+            topics=self._topics(),
+            extrinsics=extrinsics,
+            problems=tuple(problems),
+            complete=not self.source.damage,
+        )
+
+    def _damage(self) -> Iterator[Problem]:
+        damage = self.source.damage
+        for text in damage.texts:
+            yield Problem(code="log.damaged", severity="warning", text=f"The log is incomplete: {text}.")
+
+    def _sensor_problems(self, imu: Imu, gnss: Gnss, extrinsics: Sequence[Extrinsic]) -> Iterator[Problem]:
+        starts = [self.tracks["lidar"].header_ns[0]] if self.tracks["lidar"].header_ns else []
+        for role in ROLES:
+            topic, track = self.roles.of(role), self.tracks[role]
+            header = np.array(track.header_ns, np.int64)
+            start = (
+                starts[0] if starts and not self._shift_ns(role) else (int(header[0]) if len(header) else 0)
+            )
+            yield from stamp_problems(role, topic, header, np.array(track.receive_ns, np.int64), start)
+            if track.broken:
+                text = f"{track.broken} messages of {topic} do not fit their type ({track.broken_reason}) and are left out."
+                yield Problem(code=f"{role}.broken", severity="warning", text=text, topic=topic)
+            if shift := self._shift_ns(role):
+                text = (
+                    f"{topic} is stamped by another clock than the LiDAR. Its stamps are shifted by {shift / 1e9:.3f} s, "
+                    f"as the times of recording suggest (good to some milliseconds); give ingest.{role}_offset_s if you know."
+                )
+                yield Problem(code=f"{role}.clock_shifted", severity="warning", text=text, topic=topic)
+        yield from self._imu_problems(imu, extrinsics)
+        yield from gnss_problems(gnss, self.roles.gnss)
+
+    def _imu_problems(self, imu: Imu, extrinsics: Sequence[Extrinsic]) -> Iterator[Problem]:
+        mounted = next((e for e in extrinsics if e.sensor == "imu"), None)
+        if mounted is None:
+            return
+        R = np.array(mounted.T_base_sensor)[:3, :3]
+        yield from imu_problems(imu, self.roles.imu, R, mounted.source != "assumed identity")
+        if self._in_g():
+            text = f"{self.roles.imu} gives acceleration in units of gravity; it is multiplied by {GRAVITY_M_S2}."
+            yield Problem(code="imu.units_g", severity="info", text=text, topic=self.roles.imu)
+
+    def _coverage(self, tally: ScanTally) -> Iterator[Problem]:
+        """Sensors that do not measure while the LiDAR does."""
+        for role in ("imu", "gnss", "wheel"):
+            stamps = self._stamps(role)
+            if (
+                len(stamps)
+                and tally.scans
+                and (stamps.max() < tally.first_ns or stamps.min() > tally.last_ns)
+            ):
+                topic = self.roles.of(role)
+                text = f"{topic} does not overlap the LiDAR's scans in time; check the clocks or ingest.{role}_offset_s."
+                yield Problem(code=f"{role}.no_overlap", severity="warning", text=text, topic=topic)
+
+    def _topics(self) -> tuple[Topic, ...]:
+        return tuple(
+            Topic(
+                name=topic.name,
+                type=topic.type,
+                role=_role(self._role.get(topic.name), topic.kind),
+                messages=topic.count,
+                rate_hz=1e9 / topic.period_ns if topic.period_ns else 0.0,
+                first_ns=topic.first_ns,
+                last_ns=topic.last_ns,
+                remark=topic.remark,
+            )
+            for topic in self.source.topics
+        )
+
+
+TopicRole = Literal["lidar", "imu", "gnss", "wheel", "images", "tf", "unused"]
+
+
+def _role(used: str | None, kind: str) -> TopicRole:
+    for role in ("lidar", "imu", "gnss", "wheel"):
+        if used == role:
+            return role
+    if kind == "tf":
+        return "tf"
+    return "images" if kind == "images" else "unused"
+
+
+CLOUDS = (PointCloud2, LivoxCloud, CloudFile)
