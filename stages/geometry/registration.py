@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8, se3_exp
 from scanloom.stages.geometry.voxel_map import F4, I4, I8, STEPS, VoxelMap, fit_surface, nearest
-from scanloom.stages.geometry.voxels import unpack
+from scanloom.stages.geometry.voxels import Float, Int, unpack
 
 __all__ = ["Registration", "VoxelMap", "align"]
 
@@ -41,6 +41,7 @@ class Registration:
     sigma2 : sum w e^2 / (sum w - 6), m2 (methods 1.7).
     points, normals : (k, 3) matched source points and their partners' normals, both in the source frame.
     weights : (k,) of these residuals.
+    normal_variance : (k,) of the direction of these normals, from the fit of their surfaces, rad2.
     """
 
     T_target_source: F8
@@ -53,6 +54,7 @@ class Registration:
     points: F8
     normals: F8
     weights: F8
+    normal_variance: F8
 
 
 def align(
@@ -63,6 +65,7 @@ def align(
     max_distance_m: float,
     scale_m: float,
     max_iterations: int = 20,
+    free: F8 | None = None,
 ) -> Registration:
     """Move `source` (n, 3), m, from the initial pose (4, 4) onto the surfaces of `target`.
 
@@ -70,12 +73,14 @@ def align(
     ----------
     max_distance_m : a point farther than this from every map point has no partner; at most one voxel is looked at.
     scale_m : residual at which the robust weight falls to a quarter.
+    free : (6, k) directions of the tangent, as columns, in which the pose may move; all unless given.
 
     Few partners give `converged=False` and the best pose so far; nothing is raised.
     """
     points = np.ascontiguousarray(source, dtype=np.float64).reshape(-1, 3)
     T = np.array(T_target_source, dtype=np.float64)
     partner = _Partners(len(points))
+    basis = np.eye(6) if free is None else np.asarray(free, float)
     converged, iterations = False, 0
     H, residual = np.zeros((6, 6)), _Residuals()
     while iterations < max_iterations and not converged:
@@ -86,7 +91,7 @@ def align(
             H, b, residual = partner.linearise(points, T, scale_m)
             if residual.matches < MIN_MATCHES:
                 break
-            step = np.linalg.lstsq(H, -b, rcond=1e-12)[0]
+            step = _step(H, b, basis)
             T = T @ se3_exp(step)
             if _small(step):
                 break
@@ -111,6 +116,7 @@ class _Partners:
         self.mean = np.zeros((n, 3))
         self.normal = np.zeros((n, 3))
         self.shape = np.zeros(n)
+        self.normal_variance = np.zeros(n)
         self.weight = np.zeros(n)
 
     def search(self, target: VoxelMap, points: F8, T: F8, max_distance_m: float) -> None:
@@ -118,12 +124,18 @@ class _Partners:
             points, T, min(max_distance_m, target.voxel_size_m) ** 2, target.surface_radius_m**2, target.voxel_size_m,
             target.inserts, target.refit_after, STEPS, target.keys, target.values, target.voxel_key, target.count,
             target.offset, target.surface, target.fitted, self.mean, self.normal, self.shape,
+            self.normal_variance,
         )  # fmt: skip
 
     def linearise(self, points: F8, T: F8, scale_m: float) -> tuple[F8, F8, _Residuals]:
         H, b = np.zeros((6, 6)), np.zeros(6)
         sums = _linearise(points, T, scale_m**2, self.mean, self.normal, self.shape, H, b, self.weight)
         return H, b, _Residuals(*sums)
+
+
+def _step(H: F8, b: F8, basis: F8) -> F8:
+    step: F8 = basis @ np.linalg.lstsq(basis.T @ H @ basis, -basis.T @ b, rcond=1e-12)[0]
+    return step
 
 
 def _small(step: F8) -> bool:
@@ -158,14 +170,15 @@ def _result(
         points=points[matched],
         normals=partner.normal[matched] @ T[:3, :3],
         weights=partner.weight[matched],
+        normal_variance=partner.normal_variance[matched],
     )
 
 
 @kernel
 def _search(
-    points: F8, T: F8, limit2: float, radius2: float, size: float, inserts: int, refit_after: int, steps: I8,
+    points: F8, T: F8, limit2: Float, radius2: Float, size: Float, inserts: Int, refit_after: Int, steps: I8,
     keys: I8, values: I4, voxel_key: I8, count: I4, offset: F4, surface: F4, fitted: I4,
-    mean: F8, normal: F8, shape: F8,
+    mean: F8, normal: F8, shape: F8, normal_variance: F8,
 ) -> None:  # fmt: skip
     a, vectors = np.empty((3, 3)), np.empty((3, 3))
     for n in range(len(points)):
@@ -188,12 +201,13 @@ def _search(
         mean[n, 2] = k * size + surface[v, c, 2]
         for r in range(3):
             normal[n, r] = surface[v, c, 3 + r]
-        shape[n] = surface[v, c, 9]
+        shape[n] = surface[v, c, 6]
+        normal_variance[n] = surface[v, c, 7]
 
 
 @kernel
 def _linearise(
-    points: F8, T: F8, scale2: float, mean: F8, normal: F8, shape: F8, H: F8, b: F8, weight: F8
+    points: F8, T: F8, scale2: Float, mean: F8, normal: F8, shape: F8, H: F8, b: F8, weight: F8
 ) -> tuple[int, float, float, int, float]:
     J = np.empty(6)
     matches, inliers = 0, 0

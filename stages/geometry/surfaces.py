@@ -6,6 +6,7 @@ import numpy as np
 
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.voxels import Int
 
 JACOBI_SWEEPS = 12
 _OFF_DIAGONAL = 1e-14
@@ -33,7 +34,7 @@ def eigen_symmetric_3(a: F8, vectors: F8) -> None:
 
 
 @kernel
-def _rotate(a: F8, vectors: F8, p: int, q: int) -> None:
+def _rotate(a: F8, vectors: F8, p: Int, q: Int) -> None:
     if a[p, q] == 0.0:
         return
     theta = (a[q, q] - a[p, p]) / (2.0 * a[p, q])
@@ -55,7 +56,7 @@ def _rotate(a: F8, vectors: F8, p: int, q: int) -> None:
 
 
 @kernel
-def _sort(a: F8, vectors: F8, p: int, q: int) -> None:
+def _sort(a: F8, vectors: F8, p: Int, q: Int) -> None:
     if a[q, q] < a[p, p]:
         a[p, p], a[q, q] = a[q, q], a[p, p]
         for i in range(3):

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.geometry.surfaces import eigen_symmetric_3
-from scanloom.stages.geometry.voxels import EMPTY, find_slot, pack, table_length, unpack
+from scanloom.stages.geometry.voxels import EMPTY, Float, Int, find_slot, pack, table_length, unpack
 
 F4 = NDArray[np.float32]
 I4 = NDArray[np.int32]
@@ -21,8 +21,8 @@ I8 = NDArray[np.int64]
 
 FIRST_CAPACITY = 2048
 UNFITTED = -1_000_000
-SURFACE_COLUMNS = 11
-"""mean (3) from the voxel's corner, first direction (3), second direction (3), their weights (2)."""
+SURFACE_COLUMNS = 8
+"""mean (3) from the voxel's corner, normal (3), weight of the shape, variance of the normal's direction (rad2)."""
 
 
 class VoxelMap:
@@ -131,7 +131,7 @@ STEPS = neighbour_steps()
 
 
 @kernel
-def _corners(keys: I8, size: float) -> F8:
+def _corners(keys: I8, size: Float) -> F8:
     out = np.empty((len(keys), 3))
     for n in range(len(keys)):
         i, j, k = unpack(keys[n])
@@ -140,7 +140,7 @@ def _corners(keys: I8, size: float) -> F8:
 
 
 @kernel
-def _index(voxel_key: I8, voxels: int, keys: I8, values: I4) -> None:
+def _index(voxel_key: I8, voxels: Int, keys: I8, values: I4) -> None:
     for v in range(voxels):
         slot = find_slot(keys, voxel_key[v])
         keys[slot] = voxel_key[v]
@@ -149,8 +149,8 @@ def _index(voxel_key: I8, voxels: int, keys: I8, values: I4) -> None:
 
 @kernel
 def _insert(
-    points: F8, size: float, spacing2: float, keys: I8, values: I4, voxel_key: I8, count: I4, offset: F4, fitted: I4,
-    voxels: int,
+    points: F8, size: Float, spacing2: Float, keys: I8, values: I4, voxel_key: I8, count: I4, offset: F4, fitted: I4,
+    voxels: Int,
 ) -> tuple[int, int]:  # fmt: skip
     most = offset.shape[1]
     added = 0
@@ -183,7 +183,7 @@ def _insert(
 
 
 @kernel
-def _crowded(offset: F4, v: int, count: int, x: float, y: float, z: float, spacing2: float) -> bool:
+def _crowded(offset: F4, v: Int, count: Int, x: Float, y: Float, z: Float, spacing2: Float) -> bool:
     for c in range(count):
         dx, dy, dz = offset[v, c, 0] - x, offset[v, c, 1] - y, offset[v, c, 2] - z
         if dx * dx + dy * dy + dz * dz < spacing2:
@@ -193,11 +193,11 @@ def _crowded(offset: F4, v: int, count: int, x: float, y: float, z: float, spaci
 
 @kernel
 def nearest(
-    x: float,
-    y: float,
-    z: float,
-    limit2: float,
-    size: float,
+    x: Float,
+    y: Float,
+    z: Float,
+    limit2: Float,
+    size: Float,
     steps: I8,
     keys: I8,
     values: I4,
@@ -229,7 +229,7 @@ def nearest(
 
 
 @kernel
-def _gap2(inside: float, step: int, size: float) -> float:
+def _gap2(inside: Float, step: Int, size: Float) -> float:
     """Squared distance along one axis to the neighbouring voxel in direction `step`."""
     if step == 0:
         return 0.0
@@ -239,7 +239,7 @@ def _gap2(inside: float, step: int, size: float) -> float:
 
 @kernel
 def fit_surface(
-    v: int, c: int, radius2: float, size: float, steps: I8, keys: I8, values: I4, count: I4, offset: F4,
+    v: Int, c: Int, radius2: Float, size: Float, steps: I8, keys: I8, values: I4, count: I4, offset: F4,
     voxel_key: I8, surface: F4, a: F8, vectors: F8,
 ) -> None:  # fmt: skip
     """Fit the surface at point c of voxel v to the stored points within the radius; `a`, `vectors` are scratch."""
@@ -280,8 +280,8 @@ def fit_surface(
     surface[v, c, 0], surface[v, c, 1], surface[v, c, 2] = x + sx, y + sy, z + sz
     for r in range(3):
         surface[v, c, 3 + r] = vectors[r, 0]
-        surface[v, c, 6 + r] = vectors[r, 1]
-    surface[v, c, 9], surface[v, c, 10] = shape_weights(a[0, 0], a[1, 1], a[2, 2], n)
+    surface[v, c, 6] = shape_weight(a[0, 0], a[1, 1], a[2, 2], n)
+    surface[v, c, 7] = max(a[0, 0], 0.0) / (n * max(a[1, 1], 1e-12))
 
 
 MIN_NEIGHBOURS = 6
@@ -289,12 +289,12 @@ SURFACE_NOISE2 = 0.05**2
 
 
 @kernel
-def shape_weights(small: float, middle: float, large: float, n: int) -> tuple[float, float]:
-    """Weights of the residuals along the first and second direction, from the eigenvalues (m2) of n points.
+def shape_weight(small: Float, middle: Float, large: Float, n: Int) -> float:
+    """Weight of a residual along the normal, from the eigenvalues (m2) of the n points around.
 
     1 on a clean plane and falling with its roughness; 0 where the points are too few or form a line, since a line of
     returns on a plane (one beam's ring) says nothing about the direction across it.
     """
     if n < MIN_NEIGHBOURS or middle < 0.005 * large or small > 0.2 * middle:
-        return 0.0, 0.0
-    return SURFACE_NOISE2 / (SURFACE_NOISE2 + max(small, 0.0)), 0.0
+        return 0.0
+    return SURFACE_NOISE2 / (SURFACE_NOISE2 + max(small, 0.0))

@@ -6,10 +6,16 @@ The table is open-addressed with linear probing: arrays `keys` (EMPTY where free
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scanloom.stages.geometry.kernels import kernel
+
+Int = int | np.integer[Any]
+"""A whole number inside a kernel, where numpy scalars pass for Python's."""
+Float = float | np.floating[Any]
 
 EMPTY = -1
 INDEX_BITS = 21
@@ -43,14 +49,14 @@ def _rows(points: ArrayLike) -> NDArray[np.floating]:
 
 
 @kernel
-def pack(i: int, j: int, k: int) -> int:
+def pack(i: Int, j: Int, k: Int) -> int:
     """Key of the voxel with indices (i, j, k)."""
     i, j, k = i + INDEX_OFFSET, j + INDEX_OFFSET, k + INDEX_OFFSET
     return ((i & INDEX_MASK) << (2 * INDEX_BITS)) | ((j & INDEX_MASK) << INDEX_BITS) | (k & INDEX_MASK)
 
 
 @kernel
-def unpack(key: int) -> tuple[int, int, int]:
+def unpack(key: Int) -> tuple[int, int, int]:
     """Indices of the voxel with this key."""
     i = (key >> (2 * INDEX_BITS)) & INDEX_MASK
     j = (key >> INDEX_BITS) & INDEX_MASK
@@ -58,7 +64,7 @@ def unpack(key: int) -> tuple[int, int, int]:
 
 
 @kernel
-def find_slot(keys: NDArray[np.int64], key: int) -> int:
+def find_slot(keys: NDArray[np.int64], key: Int) -> int:
     """Slot that holds `key`, or the free slot where it belongs."""
     mask = len(keys) - 1
     slot = np.int64((np.uint64(key) * _MIX) >> _HIGH) & mask
@@ -68,14 +74,14 @@ def find_slot(keys: NDArray[np.int64], key: int) -> int:
 
 
 @kernel
-def _key_of(x: float, y: float, z: float, per_m: float) -> int:
+def _key_of(x: Float, y: Float, z: Float, per_m: Float) -> int:
     if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
         return EMPTY
     return pack(np.int64(np.floor(x * per_m)), np.int64(np.floor(y * per_m)), np.int64(np.floor(z * per_m)))
 
 
 @kernel
-def _keys(points: NDArray[np.floating], per_m: float) -> NDArray[np.int64]:
+def _keys(points: NDArray[np.floating], per_m: Float) -> NDArray[np.int64]:
     out = np.empty(len(points), np.int64)
     for n in range(len(points)):
         out[n] = _key_of(float(points[n, 0]), float(points[n, 1]), float(points[n, 2]), per_m)
@@ -83,7 +89,7 @@ def _keys(points: NDArray[np.floating], per_m: float) -> NDArray[np.int64]:
 
 
 @kernel
-def _first_per_voxel(points: NDArray[np.floating], per_m: float, length: int) -> NDArray[np.int64]:
+def _first_per_voxel(points: NDArray[np.floating], per_m: Float, length: Int) -> NDArray[np.int64]:
     keys = np.full(length, EMPTY, np.int64)
     out = np.empty(len(points), np.int64)
     found = 0

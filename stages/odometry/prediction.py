@@ -1,0 +1,112 @@
+"""What motion to expect before a scan is looked at: from gyro and wheels, else as fast as before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanloom.schemas.session import Session
+from scanloom.schemas.tracks import Imu, Wheel
+from scanloom.stages.geometry.motion import MotionTrack
+from scanloom.stages.geometry.se3 import F8, inverse, se3_exp, se3_log
+
+GYRO_STD_RAD_PER_SQRT_S = 0.002
+WHEEL_STD_SHARE = 0.02
+GUESS_RATE_STD_RAD_S = 0.5
+GUESS_ACCELERATION_STD_M_S2 = 3.0
+SIDE_SLIP_STD_SHARE = 0.01
+SLIP_M_S = 0.5
+SCALE_PRIOR_M = 20.0
+SCALE_MEMORY_M = 500.0
+MIN_STEP_M = 0.1
+MAX_SCALE_ERROR = 0.1
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Expected motion since the last scan: pose of the LiDAR now in the LiDAR then, and its covariance (6, 6)."""
+
+    T_last_now: F8
+    covariance: F8
+    known: bool
+    """False when neither sensors nor earlier scans tell anything."""
+
+
+class Predictor:
+    """Expected motion between scans.
+
+    Rotation from the gyro and translation from the wheels where they cover the time, else both at the rate of the
+    last registered motion. The wheels' scale is estimated from well registered scans: the ratio of sums of LiDAR and
+    wheel displacement along x of the base, with a prior of 1 and a memory of some hundred metres; steps where the two
+    differ by more than 0.5 m/s are slip and left out (methods 1.8).
+    """
+
+    def __init__(self, session: Session, imu: Imu, wheel: Wheel) -> None:
+        self._track = MotionTrack.build(imu, wheel, session)
+        self._T_base_lidar = np.array(session.T_base("lidar"))
+        self._twist: F8 | None = None
+        self._lidar_m = self._wheel_m = SCALE_PRIOR_M
+
+    @property
+    def wheel_scale(self) -> float:
+        """LiDAR metres per wheel metre."""
+        return self._lidar_m / self._wheel_m
+
+    def predict(self, last_ns: int, now_ns: int) -> Prediction:
+        """Motion of the LiDAR between two reference times."""
+        cover = self._track.covers(last_ns, now_ns)
+        T = self._track.relative(last_ns, now_ns, self._twist)
+        if cover.translation:
+            T = self._scaled(T)
+        known = self._twist is not None or cover.translation
+        return Prediction(
+            T, self._covariance(T, 1e-9 * (now_ns - last_ns), cover.rotation, cover.translation), known
+        )
+
+    def learn(self, last_ns: int, now_ns: int, T_last_now: F8, *, well_seen: bool) -> None:
+        """Take note of the motion that was found; `well_seen`: along every direction by the scan itself."""
+        dt = 1e-9 * (now_ns - last_ns)
+        if dt <= 0:
+            return
+        self._twist = se3_log(T_last_now) / dt
+        if well_seen and self._track.covers(last_ns, now_ns).translation:
+            self._learn_scale(
+                self._forward(self._track.relative(last_ns, now_ns)), self._forward(T_last_now), dt
+            )
+
+    def _learn_scale(self, wheel_m: float, lidar_m: float, dt: float) -> None:
+        off = abs(lidar_m - self.wheel_scale * wheel_m)
+        if abs(wheel_m) < MIN_STEP_M or off > min(SLIP_M_S * dt, MAX_SCALE_ERROR * abs(wheel_m)):
+            return
+        self._lidar_m += abs(lidar_m)
+        self._wheel_m += abs(wheel_m)
+        forget = min(1.0, SCALE_MEMORY_M / self._wheel_m)
+        self._lidar_m, self._wheel_m = self._lidar_m * forget, self._wheel_m * forget
+
+    def _forward(self, T_lidar: F8) -> float:
+        """Displacement of the base origin along x of the base."""
+        return float((self._T_base_lidar @ T_lidar @ inverse(self._T_base_lidar))[0, 3])
+
+    def _scaled(self, T_lidar: F8) -> F8:
+        T_base = self._T_base_lidar @ T_lidar @ inverse(self._T_base_lidar)
+        T_base[:3, 3] *= self.wheel_scale
+        T: F8 = inverse(self._T_base_lidar) @ T_base @ self._T_base_lidar
+        return T
+
+    def _covariance(self, T: F8, dt: float, rotation: bool, translation: bool) -> F8:
+        """Independent errors of rotation and translation, isotropic, growing with time and way."""
+        way = float(np.linalg.norm(T[:3, 3]))
+        turn_std = GYRO_STD_RAD_PER_SQRT_S * np.sqrt(dt) if rotation else GUESS_RATE_STD_RAD_S * dt
+        way_std = WHEEL_STD_SHARE * way if translation else GUESS_ACCELERATION_STD_M_S2 * dt * max(dt, 0.1)
+        return np.diag([turn_std**2 + 1e-8] * 3 + [way_std**2 + 1e-6] * 3)
+
+
+FORWARD_GUESSES_M = (0.0, 1.0, -1.0, 2.0, 3.0)
+
+
+def forward_guesses(T_base_lidar: F8) -> list[F8]:
+    """Motions of the LiDAR (4, 4) to try when nothing is known: the vehicle stands, or drives ahead or back."""
+    return [
+        inverse(T_base_lidar) @ se3_exp([0, 0, 0, step, 0, 0]) @ T_base_lidar for step in FORWARD_GUESSES_M
+    ]

@@ -1,0 +1,63 @@
+"""Settings of the odometry stage."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Settings(BaseModel):
+    """How scans are registered to the local map."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    voxel_size_m: float = Field(
+        1.0, ge=0.1, le=5.0, description="edge of a voxel of the local map, also the reach of the search, m"
+    )
+    points_per_voxel: int = Field(
+        20, ge=4, le=100, description="most points kept in a voxel of the local map"
+    )
+    map_spacing_m: float = Field(
+        0.4, ge=0.02, le=5.0, description="scans are thinned to this before they enter the map, m"
+    )
+    source_voxel_m: float = Field(
+        1.0, ge=0.05, le=10.0, description="scans are thinned to this before they are registered, m"
+    )
+    map_radius_m: float = Field(
+        100.0, ge=10.0, le=1000.0, description="the local map is kept within this distance, m"
+    )
+    insert_m: float = Field(
+        0.2, ge=0.0, le=10.0, description="way after which a scan enters the local map, m"
+    )
+    insert_rad: float = Field(
+        0.05, ge=0.0, le=3.0, description="turn after which a scan enters the local map, rad"
+    )
+    keyframe_m: float = Field(1.0, ge=0.05, le=50.0, description="way between keyframes, m")
+    keyframe_rad: float = Field(0.2, ge=0.01, le=3.0, description="turn between keyframes, rad")
+    keyframe_s: float = Field(5.0, ge=0.1, le=1000.0, description="longest time between keyframes, s")
+    max_iterations: int = Field(20, ge=1, le=200, description="most searches for partners per scan")
+    first_deviation_m: float = Field(
+        0.5, ge=0.01, le=10.0, description="expected error of the first prediction, m"
+    )
+    least_scale_m: float = Field(0.1, ge=0.01, le=5.0, description="smallest scale of the robust kernel, m")
+    most_scale_m: float = Field(0.5, ge=0.01, le=10.0, description="largest scale of the robust kernel, m")
+    least_inlier_ratio: float = Field(
+        0.15, ge=0.0, le=1.0, description="registrations with a smaller share of inliers are not used"
+    )
+    least_bound_m: float = Field(
+        1.0, ge=0.01, le=100.0, description="corrections up to this are always plausible, m"
+    )
+    bound_rad: float = Field(
+        0.2, ge=0.01, le=3.2, description="largest plausible correction of rotation, rad"
+    )
+    least_p: float = Field(
+        0.5,
+        ge=0.0,
+        le=1.0,
+        description="directions observed with less probability are taken from the prediction",
+    )
+    point_noise_m: float = Field(0.02, ge=0.001, le=1.0, description="noise of a point, m")
+    covariance_inflation: float = Field(
+        4.0, ge=0.1, le=1000.0, description="factor on sigma^2 / lambda: residuals share the map's errors"
+    )
+    floor_m: float = Field(0.005, ge=0.0, le=1.0, description="least standard deviation of translation, m")
+    floor_rad: float = Field(0.0003, ge=0.0, le=0.1, description="least standard deviation of rotation, rad")
