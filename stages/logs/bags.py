@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanloom.schemas.session import Extrinsic, Problem
+from scanloom.schemas.errors import InvalidInput
+from scanloom.schemas.session import Extrinsic, Problem, RawLog
 from scanloom.stages.logs.containers import Container
+from scanloom.stages.logs.mcap import McapFile
 from scanloom.stages.logs.messages import decode, kind_of, ros2_name
 from scanloom.stages.logs.records import Damage, Message, TopicInfo
 
@@ -118,3 +121,34 @@ def _info(topic: str, type_name: str, encoding: str, stamps: NDArray[np.int64]) 
         period_ns=int(np.median(np.diff(stamps))) if len(stamps) > 1 else 0,
         remark="" if known else f"encoding {encoding!r} cannot be read",
     )
+
+
+def open_bags(raw_log: RawLog, format: str) -> BagLog:
+    """Open all files of a bag; those that cannot be opened are damage as long as one can.
+
+    Raises
+    ------
+    InvalidInput : none can be opened.
+    """
+    files: list[Container] = []
+    opening = Damage()
+    errors: list[InvalidInput] = []
+    for name in raw_log.names:
+        opener = _opener(name)
+        if opener is None:
+            continue
+        try:
+            files.append(opener(raw_log.path(name)))
+        except InvalidInput as error:
+            errors.append(error)
+            opening.texts.append(f"{name} cannot be opened: {error.what}")
+            opening.lost_bytes += raw_log.path(name).stat().st_size
+    if not files:
+        raise errors[0] if errors else InvalidInput("The folder holds no bag file.", where=str(raw_log.root))
+    return BagLog(format, files, opening=opening)
+
+
+def _opener(name: str) -> Callable[[Path], Container] | None:
+    if name.endswith((".mcap", ".mcap.zstd")):
+        return McapFile
+    return None

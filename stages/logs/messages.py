@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+
 from scanloom.stages.geometry.se3 import F8, matrix_from_quaternion, pose
 from scanloom.stages.logs.records import (
     LIVOX_POINT,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from scanloom.schemas.errors import InvalidInput
 from scanloom.schemas.session import RawLog
-from scanloom.stages.logs.bags import BagLog
-from scanloom.stages.logs.mcap import McapFile
+from scanloom.stages.logs.bags import open_bags
+from scanloom.stages.logs.formats import detect
 from scanloom.stages.logs.records import LogSource
 
 
@@ -20,8 +20,6 @@ def open_log(raw_log: RawLog, rate_hz: float = 10.0) -> LogSource:
     ------
     InvalidInput : the files are no log.
     """
-    from scanloom.stages.logs.formats import detect
-
     if raw_log.root is None or not raw_log.names:
         raise InvalidInput(
             "The log holds no file.", next_step="give a bag, an .mcap file or a folder of scans"
@@ -35,4 +33,4 @@ def open_log(raw_log: RawLog, rate_hz: float = 10.0) -> LogSource:
         from scanloom.stages.logs.pointfiles import open_point_files
 
         return open_point_files(raw_log, rate_hz)
-    return BagLog("mcap", [McapFile(raw_log.path(n)) for n in raw_log.names if n.endswith(".mcap")])
+    return open_bags(raw_log, found)
