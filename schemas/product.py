@@ -155,6 +155,7 @@ class Table(Product):
 
 
 ItemT = TypeVar("ItemT", bound=Table)
+Through = Callable[[Iterator[Any]], Iterator[Any]]
 
 
 class Stream(Product, Generic[ItemT]):
@@ -201,18 +202,20 @@ class Stream(Product, Generic[ItemT]):
         return len(index)
 
     @classmethod
-    def open(cls, path: Path) -> Self:
+    def open(cls, path: Path, through: Through = iter) -> Self:
+        """`through` wraps each pass over the items of the file, for instance to read ahead."""
         with _damage_named(path):
             file = pq.ParquetFile(path, page_checksum_verification=True)
             footer = _read_footer(file, cls, path)
-        return cls(_FileItems(path, cls.ITEM, footer["attributes"]["items"]))
+        return cls(_FileItems(path, cls.ITEM, footer["attributes"]["items"], through))
 
 
 class _FileItems:
     """Items of a stream in a file. Empty items have no row group of their own."""
 
-    def __init__(self, path: Path, item: type[Table], index: list[dict[str, Any]]) -> None:
+    def __init__(self, path: Path, item: type[Table], index: list[dict[str, Any]], through: Through = iter) -> None:
         self.path = path
+        self._through = through
         self.item = item
         self.index = index
         self._groups: list[int | None] = []
@@ -225,6 +228,9 @@ class _FileItems:
         return len(self.index)
 
     def __iter__(self) -> Iterator[Any]:
+        return self._through(self._pass())
+
+    def _pass(self) -> Iterator[Any]:
         with _damage_named(self.path):
             file = pq.ParquetFile(self.path, page_checksum_verification=True)
         for i in range(len(self.index)):
@@ -332,31 +338,42 @@ class Part(Generic[ProductT]):
 
 
 class Parts(Sequence[ProductT]):
-    """Products of one type from several places, ordered by coordinate."""
+    """Products of one type from several places, ordered by coordinate.
 
-    def __init__(self, parts: Iterable[tuple[Coordinate, ProductT]]) -> None:
+    With `load`, the entries are what `load` makes products of, each time one is asked for: a thousand tiles are then
+    in memory one by one.
+    """
+
+    def __init__(
+        self, parts: Iterable[tuple[Coordinate, Any]], *, load: Callable[[Any], ProductT] | None = None
+    ) -> None:
         self._parts = sorted(parts, key=lambda pair: pair[0])
+        self._load = load
+
+    def _product(self, entry: Any) -> ProductT:
+        product: ProductT = entry if self._load is None else self._load(entry)
+        return product
 
     def __len__(self) -> int:
         return len(self._parts)
 
     def __getitem__(self, i: Any) -> Any:
         if isinstance(i, slice):
-            return [product for _, product in self._parts[i]]
-        return self._parts[i][1]
+            return [self._product(entry) for _, entry in self._parts[i]]
+        return self._product(self._parts[i][1])
 
     def __iter__(self) -> Iterator[ProductT]:
-        return (product for _, product in self._parts)
+        return (self._product(entry) for _, entry in self._parts)
 
     def items(self) -> Iterator[tuple[dict[str, str], ProductT]]:
-        return ((dict(coordinate), product) for coordinate, product in self._parts)
+        return ((dict(coordinate), self._product(entry)) for coordinate, entry in self._parts)
 
     def by(self, axis: str) -> dict[str, Parts[ProductT]]:
         """Group by one axis, for instance `by("session")`, in sorted order."""
-        groups: dict[str, list[tuple[Coordinate, ProductT]]] = {}
-        for coordinate, product in self._parts:
-            groups.setdefault(dict(coordinate)[axis], []).append((coordinate, product))
-        return {value: Parts(group) for value, group in sorted(groups.items())}
+        groups: dict[str, list[tuple[Coordinate, Any]]] = {}
+        for coordinate, entry in self._parts:
+            groups.setdefault(dict(coordinate)[axis], []).append((coordinate, entry))
+        return {value: Parts(group, load=self._load) for value, group in sorted(groups.items())}
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -1,0 +1,248 @@
+"""Where tasks run: in this process, on local processes, or on any Dask cluster."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import queue
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+from scanloom.pipeline.task import Json, execute
+from scanloom.schemas.errors import ScanloomError, UsageError
+
+log = logging.getLogger(__name__)
+
+THREADS = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+    "ARROW_NUM_THREADS": "1",
+    "MALLOC_TRIM_THRESHOLD_": "65536",
+}
+"""Environment of local workers: one native thread each, and freed memory goes back to the system."""
+
+WORKERS_WITHIN_S = 60.0
+"""How long to wait for the first worker of a cluster."""
+
+Outcome = tuple[str, Json | BaseException]
+"""Key of a task, and the worker's answer or the reason that there is none."""
+
+
+class Executor(Protocol):
+    """Carries out orders."""
+
+    def slots(self) -> int:
+        """Tasks that may be under way at once."""
+
+    def submit(self, key: str, spec: Json) -> None:
+        """Start a task."""
+
+    def next(self, timeout_s: float) -> Outcome | None:
+        """Wait for a task to end; None when none did in time."""
+
+    def close(self) -> None:
+        """Stop everything that is under way."""
+
+
+def executor(cluster: str, workers: int | None) -> Executor:
+    """The executor of `--cluster`: `none`, `local`, an address such as `tcp://host:8786`, or `module:factory`.
+
+    Raises
+    ------
+    UsageError : there is no such cluster, or it has no workers.
+    """
+    if workers is not None and workers < 1:
+        raise UsageError(f"{workers} workers cannot do anything", next_step="give --workers a number from 1")
+    if cluster == "none":
+        return InProcess()
+    if cluster == "local":
+        return DaskExecutor(lambda: _local(workers))
+    if "://" in cluster:
+        return DaskExecutor(lambda: _remote(cluster))
+    if ":" in cluster:
+        return DaskExecutor(lambda: _made(cluster, workers))
+    raise UsageError(
+        f"cluster {cluster!r} is unknown", next_step="choose none, local, tcp://host:port or module:factory"
+    )
+
+
+class InProcess:
+    """One task at a time, in this process: for debugging and tests."""
+
+    def __init__(self) -> None:
+        self._waiting: list[tuple[str, Json]] = []
+
+    def slots(self) -> int:
+        return 1
+
+    def submit(self, key: str, spec: Json) -> None:
+        self._waiting.append((key, spec))
+
+    def next(self, timeout_s: float) -> Outcome | None:
+        key, spec = self._waiting.pop(0)
+        return key, execute(spec)
+
+    def close(self) -> None:
+        self._waiting.clear()
+
+
+class DaskExecutor:
+    """Tasks on a Dask cluster; never more under way than it has threads, so that the driver keeps the order."""
+
+    def __init__(self, connect: Callable[[], tuple[Any, Any]]) -> None:
+        with _quiet():
+            self._client, self._cluster = connect()
+        self._done: queue.Queue[tuple[str, Any]] = queue.Queue()
+        self._futures: dict[str, Any] = {}
+        self._counted_at = 0.0
+        self._threads = 0
+        self._await_workers()
+
+    def _await_workers(self) -> None:
+        try:
+            self._client.wait_for_workers(1, timeout=WORKERS_WITHIN_S)
+        except TimeoutError as error:
+            self.close()
+            raise UsageError(
+                f"the cluster has no worker after {WORKERS_WITHIN_S:.0f} s",
+                next_step="start workers, or use --cluster local",
+            ) from error
+
+    def slots(self) -> int:
+        if time.monotonic() - self._counted_at > 2.0 or not self._threads:
+            self._threads = sum(self._client.nthreads().values())
+            self._counted_at = time.monotonic()
+        return max(self._threads, 1)
+
+    def submit(self, key: str, spec: Json) -> None:
+        future = self._client.submit(
+            execute, spec, key=f"{spec['identity']['stage']}-{key}", pure=False, retries=0
+        )
+        self._futures[key] = future
+        future.add_done_callback(lambda done, key=key: self._done.put((key, done)))
+
+    def next(self, timeout_s: float) -> Outcome | None:
+        try:
+            key, future = self._done.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+        self._futures.pop(key, None)
+        if future.status == "finished":
+            answer: Json = future.result()
+            return key, answer
+        error = future.exception() if future.status == "error" else RuntimeError(f"task was {future.status}")
+        return key, error
+
+    def close(self) -> None:
+        with _quiet():
+            for future in self._futures.values():
+                future.cancel()
+            self._client.close(timeout=5)
+            if self._cluster is not None:
+                self._cluster.close(timeout=5)
+
+
+def worker_death(error: BaseException) -> str:
+    """In words, when the error says that workers died over a task; empty otherwise."""
+    if type(error).__name__ != "KilledWorker":
+        return ""
+    return "the worker died twice over it (out of memory, or a crash in native code)"
+
+
+def _local(workers: int | None) -> tuple[Any, Any]:
+    """Processes of this machine, one per core."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    os.environ.update({name: os.environ.get(name, value) for name, value in THREADS.items()})
+    dask.config.set(
+        {
+            "distributed.scheduler.allowed-failures": 1,
+            "distributed.scheduler.work-stealing": False,
+            "distributed.scheduler.worker-saturation": 1.0,
+            "distributed.worker.multiprocessing-method": "forkserver",
+            "distributed.nanny.preload": [],
+            "distributed.nanny.environ": THREADS,
+            "distributed.admin.tick.limit": "1h",
+            "distributed.comm.timeouts.connect": "60s",
+        }
+    )
+    _preload_forkserver()
+    cluster = LocalCluster(
+        n_workers=workers or os.cpu_count() or 1,
+        threads_per_worker=1,
+        processes=True,
+        memory_limit=0,
+        dashboard_address=None,
+        silence_logs=logging.CRITICAL,
+        host="127.0.0.1",
+    )
+    return Client(cluster, set_as_default=False), cluster
+
+
+def _preload_forkserver() -> None:
+    """Workers fork from a process that has the imports done already."""
+    import multiprocessing
+
+    multiprocessing.get_context("forkserver").set_forkserver_preload(
+        ["distributed", "scanloom.pipeline.task", "pyarrow.parquet"]
+    )
+
+
+def _remote(address: str) -> tuple[Any, Any]:
+    from distributed import Client
+
+    try:
+        return Client(address, timeout=10, set_as_default=False), None
+    except (OSError, TimeoutError, ValueError) as error:
+        raise UsageError(
+            f"no Dask scheduler answers: {error}",
+            where=address,
+            next_step="check the address, or use --cluster local",
+        ) from error
+
+
+def _made(path: str, workers: int | None) -> tuple[Any, Any]:
+    """`module:factory` returns any Dask cluster object; it is asked for `workers` when it can scale."""
+    from distributed import Client
+
+    module, _, name = path.partition(":")
+    try:
+        factory = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise UsageError(f"cluster factory cannot be imported: {error}", where=path) from error
+    cluster = factory()
+    if workers is not None and hasattr(cluster, "scale"):
+        cluster.scale(workers)
+    return Client(cluster, set_as_default=False), cluster
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Dask's own log is about its plumbing; errors reach the user by other ways."""
+    for name in (
+        "distributed",
+        "distributed.nanny",
+        "distributed.worker",
+        "distributed.scheduler",
+        "tornado",
+    ):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    yield
+
+
+def unanswered(place: str, error: BaseException) -> ScanloomError:
+    """The error of a task that gave no answer."""
+    death = worker_death(error)
+    if death:
+        return ScanloomError(
+            death, where=place, next_step="use fewer --workers, or --cluster none to see it happen"
+        )
+    return ScanloomError(
+        f"the cluster gave no answer: {error}", where=place, next_step="run the same command again"
+    )

@@ -1,0 +1,103 @@
+"""The identity of a task: what its key is made of, and the order by which a worker carries it out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from scanloom.pipeline.fingerprint import SCHEMA, code_version, digest, files_digest
+from scanloom.pipeline.flow import Input, Source, Task
+from scanloom.pipeline.node import Node
+from scanloom.pipeline.store import Store
+from scanloom.pipeline.task import Json, import_path
+from scanloom.schemas.errors import InvalidInput
+from scanloom.schemas.product import Coordinate, Files
+
+
+@dataclass(frozen=True)
+class Order:
+    """A task ready to be looked up or carried out."""
+
+    key: str
+    identity: Json
+    spec: Json
+
+
+class Identifier:
+    """Makes orders; remembers code versions and the digests of source files for one run."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._code: dict[str, Json] = {}
+        self._sources: dict[tuple[Path, tuple[str, ...]], str] = {}
+
+    def order(self, task: Task, inputs: list[Input]) -> Order:
+        """The key of a task and how to compute it.
+
+        Raises
+        ------
+        InvalidInput : a source file cannot be read.
+        """
+        known, reads = [], []
+        for entry in inputs:
+            parts = [self._part(coordinate, ref) for coordinate, ref in entry.parts]
+            shown = [[None if entry.plain else dict(p["coordinate"]), p["digest"]] for p in parts]
+            known.append({"product": entry.product.NAME, "parts": shown})
+            reads.append({"product": import_path(entry.product), "plain": entry.plain, "parts": parts})
+        identity = {**self.constant(task), "inputs": known}
+        key = digest(identity)
+        node = task.node
+        spec = {
+            "store": str(self._store.root),
+            "key": key,
+            "identity": identity,
+            "stage": import_path(node.stage),
+            "settings_model": import_path(node.settings),
+            "coordinate": [list(pair) for pair in task.coordinate],
+            "place": str(task),
+            "reads": reads,
+            "writes": [import_path(product) for product in node.writes],
+        }
+        return Order(key, identity, spec)
+
+    def constant(self, task: Task) -> Json:
+        """The part of the identity that does not depend on inputs: stage, code, settings."""
+        return {
+            "schema": SCHEMA,
+            "stage": task.node.name,
+            "code": self._code_of(task.node),
+            "settings": task.settings.model_dump(mode="json"),
+        }
+
+    def _code_of(self, node: Node) -> Json:
+        if node.name not in self._code:
+            self._code[node.name] = code_version(node.stage, node.version)
+        return self._code[node.name]
+
+    def _part(self, coordinate: Coordinate, ref: Any) -> Json:
+        place = [list(pair) for pair in coordinate]
+        if isinstance(ref, Source):
+            files = ref.session.sources[ref.product]
+            root = _root(files)
+            return {
+                "coordinate": place, "path": str(root), "names": list(files.names), "digest": self._source(root, files),
+            }  # fmt: skip
+        _, artifact, part = ref
+        return {"coordinate": place, "path": str(artifact.path(part)), "digest": part.digest}
+
+    def _source(self, root: Path, files: Files) -> str:
+        mark = (root, files.names)
+        if mark not in self._sources:
+            paths: Mapping[str, Path] = {name: root / name for name in files.names}
+            self._sources[mark] = files_digest(self._store.hashes.of(paths))
+        return self._sources[mark]
+
+
+def _root(files: Files) -> Path:
+    if files.root is None:
+        if files.names:
+            raise InvalidInput("source files have no folder", next_step="give Files(root=..., names=...)")
+        return Path(".").absolute()
+    return Path(files.root).absolute()
