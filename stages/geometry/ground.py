@@ -1,0 +1,203 @@
+"""The ground under a scan: its height on a polar grid, for level and sloping roads, 16 to 128 beams.
+
+In each sector the lowest points are followed outwards, as long as they continue the slope so far (the idea of
+Himmelsbach et al. 2010: lines in polar segments). A cell with vertical extent, a wall or a car, must continue it more
+closely than a flat one. The walk starts from a plane fitted around the sensor, which gives its height and tilt.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.stages.geometry.kernels import kernel
+from scanloom.stages.geometry.se3 import F8
+
+F4 = NDArray[np.float32]
+B1 = NDArray[np.bool_]
+
+SECTORS = 180
+NEAR_M, MIDDLE_M, FAR_M = 20.0, 50.0, 120.0
+BINS = 40 + 30 + 35
+"""Cells of 0.5 m up to 20 m, of 1 m up to 50 m, of 2 m up to 120 m."""
+SEED_M = 12.0
+SEED_CELLS = 12
+HIGHEST_GROUND_M = -0.15
+"""The ground under the sensor is at least this far below it."""
+STEEPEST = 0.2
+FLAT_M = 0.25
+REACH_M = 12.0
+"""Farthest from a cell with ground that its slope is continued."""
+FIT_GATES_M = (0.5, 0.3, 0.2, 0.15)
+
+
+def ground_mask(x_m: F4, y_m: F4, z_m: F4, usable: B1, R_level_lidar: F8, height_m: float) -> B1:
+    """Which points (n,) are ground: within `height_m` above, or twice that below, the ground of their cell.
+
+    Parameters
+    ----------
+    x_m, y_m, z_m : (n,) coordinates in the LiDAR frame, m.
+    usable : (n,) points that may show where the ground is; the others are never ground.
+    R_level_lidar : (3, 3) turns the LiDAR's axes into the vehicle's, z up.
+
+    Without ground around the sensor nothing is ground.
+    """
+    lowest, highest = _extent(x_m, y_m, z_m, usable, R_level_lidar)
+    plane = seed_plane(lowest)
+    if plane is None:
+        return np.zeros(len(x_m), np.bool_)
+    height, slope = _follow(lowest, highest, plane)
+    return _near(x_m, y_m, z_m, usable, R_level_lidar, height, slope, height_m)
+
+
+def seed_plane(lowest: F8) -> F8 | None:
+    """Plane (3,) z = a + b x + c y around the sensor from the lowest heights of the cells, or None without ground."""
+    sector, bin_ = np.nonzero(np.isfinite(lowest) & (_bin_centers() < SEED_M) & (lowest < HIGHEST_GROUND_M))
+    if len(sector) < SEED_CELLS:
+        return None
+    z = lowest[sector, bin_]
+    x, y = (_bin_centers()[bin_] * d[sector] for d in _sector_directions())
+    edges = np.arange(z.min() - 0.1, z.max() + 0.3, 0.1)
+    count = np.convolve(np.histogram(z, edges)[0], (1, 2, 1), mode="same")
+    plane = np.array([edges[np.argmax(count)] + 0.05, 0.0, 0.0])
+    A = np.column_stack((np.ones(len(z)), x, y))
+    for gate in FIT_GATES_M:
+        near = np.abs(z - A @ plane) < gate
+        if near.sum() < SEED_CELLS:
+            break
+        fitted = np.linalg.lstsq(A[near], z[near], rcond=None)[0]
+        if np.hypot(fitted[1], fitted[2]) < STEEPEST:
+            plane = fitted
+    return plane
+
+
+def _bin_centers() -> F8:
+    return np.array([_center(b) for b in range(BINS)])
+
+
+def _sector_directions() -> tuple[F8, F8]:
+    direction = np.array([_direction(s) for s in range(SECTORS)])
+    return direction[:, 0], direction[:, 1]
+
+
+@kernel
+def _bin(r: float) -> int:
+    if r < NEAR_M:
+        return int(r * 2.0)
+    if r < MIDDLE_M:
+        return 40 + int(r - NEAR_M)
+    return min(70 + int((r - MIDDLE_M) * 0.5), BINS - 1)
+
+
+@kernel
+def _center(b: int) -> float:
+    if b < 40:
+        return 0.5 * b + 0.25
+    if b < 70:
+        return NEAR_M + (b - 40) + 0.5
+    return MIDDLE_M + 2.0 * (b - 70) + 1.0
+
+
+@kernel
+def _sector(x: float, y: float) -> int:
+    """Sector by the angle of a diamond, which rises with the azimuth and needs no arc tangent."""
+    norm = abs(x) + abs(y)
+    if norm == 0.0:
+        return 0
+    p = y / norm
+    turn = 1.0 + p if x >= 0.0 else 3.0 - p  # from -y in [0, 4)
+    return min(int(turn * (0.25 * SECTORS)), SECTORS - 1)
+
+
+@kernel
+def _direction(s: int) -> tuple[float, float]:
+    """Unit vector of the middle of a sector."""
+    turn = (s + 0.5) * 4.0 / SECTORS
+    y = turn - 1.0 if turn < 2.0 else 3.0 - turn
+    x = 1.0 - abs(y) if turn < 2.0 else abs(y) - 1.0
+    norm = np.sqrt(x * x + y * y)
+    return x / norm, y / norm
+
+
+@kernel
+def _extent(x: F4, y: F4, z: F4, usable: B1, R: F8) -> tuple[F8, F8]:
+    """Lowest and highest level height of the usable points of each cell (SECTORS, BINS), m; inf and -inf if none."""
+    lowest = np.full((SECTORS, BINS), np.inf)
+    highest = np.full((SECTORS, BINS), -np.inf)
+    for i in range(len(x)):
+        if not usable[i]:
+            continue
+        u = R[0, 0] * x[i] + R[0, 1] * y[i] + R[0, 2] * z[i]
+        v = R[1, 0] * x[i] + R[1, 1] * y[i] + R[1, 2] * z[i]
+        w = R[2, 0] * x[i] + R[2, 1] * y[i] + R[2, 2] * z[i]
+        r = np.sqrt(u * u + v * v)
+        if r >= FAR_M:
+            continue
+        s, b = _sector(u, v), _bin(r)
+        lowest[s, b] = min(lowest[s, b], w)
+        highest[s, b] = max(highest[s, b], w)
+    return lowest, highest
+
+
+@kernel
+def _follow(lowest: F8, highest: F8, plane: F8) -> tuple[F8, F8]:
+    """Height (SECTORS, BINS), m, of the ground at each cell's middle and its slope outwards; NaN where unknown."""
+    height = np.full((SECTORS, BINS), np.nan)
+    slope = np.zeros((SECTORS, BINS))
+    for s in range(SECTORS):
+        ux, uy = _direction(s)
+        z, r, k = plane[0], 0.0, plane[1] * ux + plane[2] * uy
+        previous = -1
+        for b in range(BINS):
+            if not np.isfinite(lowest[s, b]):
+                continue
+            at = _center(b)
+            step = at - r
+            rise = lowest[s, b] - (z + k * step)
+            reach = min(step, 4.0)
+            flat = highest[s, b] - lowest[s, b] < FLAT_M
+            above = 0.12 + 0.1 * reach if flat else 0.1 + 0.03 * reach
+            if rise > above or rise < -0.25 - 0.1 * reach:
+                continue
+            k = min(max(k + rise / (step + 4.0), -STEEPEST), STEEPEST)
+            _bridge(height[s], slope[s], previous, b, r, z, lowest[s, b])
+            z, r, previous = lowest[s, b], at, b
+            height[s, b], slope[s, b] = z, k
+        _continue(height[s], slope[s], previous, r, z, k)
+    return height, slope
+
+
+@kernel
+def _bridge(height: F8, slope: F8, previous: int, b: int, r: float, z: float, z_next: float) -> None:
+    """The line between two cells with ground, for those between them."""
+    k = (z_next - z) / (_center(b) - r)
+    for m in range(previous + 1, b):
+        height[m] = z + k * (_center(m) - r)
+        slope[m] = k
+
+
+@kernel
+def _continue(height: F8, slope: F8, previous: int, r: float, z: float, k: float) -> None:
+    for m in range(previous + 1, BINS):
+        if _center(m) > r + REACH_M:
+            break
+        height[m] = z + k * (_center(m) - r)
+        slope[m] = k
+
+
+@kernel
+def _near(x: F4, y: F4, z: F4, usable: B1, R: F8, height: F8, slope: F8, tolerance: float) -> B1:
+    out = np.zeros(len(x), np.bool_)
+    for i in range(len(x)):
+        if not usable[i]:
+            continue
+        u = R[0, 0] * x[i] + R[0, 1] * y[i] + R[0, 2] * z[i]
+        v = R[1, 0] * x[i] + R[1, 1] * y[i] + R[1, 2] * z[i]
+        w = R[2, 0] * x[i] + R[2, 1] * y[i] + R[2, 2] * z[i]
+        r = np.sqrt(u * u + v * v)
+        if r >= FAR_M:
+            continue
+        s, b = _sector(u, v), _bin(r)
+        above = w - (height[s, b] + slope[s, b] * (r - _center(b)))
+        out[i] = -2.0 * tolerance < above < tolerance
+    return out
