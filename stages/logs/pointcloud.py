@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
 from scanloom.schemas.errors import InvalidInput
 from scanloom.stages.geometry.sweep import detect_sweep, elevation_trend, sweep_times
 from scanloom.stages.logs.records import Cloud, LivoxCloud, PointCloud2, PointField
@@ -50,13 +51,32 @@ def decode_pointcloud2(message: PointCloud2) -> Cloud:
     InvalidInput : sizes contradict each other, a datatype is unknown, or x, y, z are missing; it names the field.
     """
     table, remarks = _view(message)
+    cloud = cloud_from_table(table, message.stamp_ns, height=message.height)
+    remark = "; ".join(r for r in (*remarks, cloud.remark) if r)
+    return replace(cloud, receive_ns=message.receive_ns, remark=remark)
+
+
+def cloud_from_table(table: NDArray[Any], stamp_ns: int, *, height: int = 1) -> Cloud:
+    """The columns of a structured array (n,) whose fields are named as drivers name them.
+
+    Parameters
+    ----------
+    table : fields x, y, z and any of intensity, ring, time, return number, of any types.
+    stamp_ns : stamp of the header, from which relative times count.
+    height : rows of an organised cloud, stored one after the other; 1 otherwise.
+
+    Raises
+    ------
+    InvalidInput : x, y or z is missing.
+    """
     names = {name.lower(): name for name in table.dtype.names or ()}
+    _need_xyz(names)
     x, y, z = (_column(table, names[axis], np.float32) for axis in "xyz")
-    time_ns, time_remark = _point_times(table, names, message.stamp_ns, x, y, z)
-    ring, ring_remark = _rings(table, names, message, x, y, z)
+    time_ns, time_remark = _point_times(table, names, stamp_ns, x, y, z)
+    ring, ring_remark = _rings(table, names, height, x, y, z)
     return Cloud(
-        stamp_ns=message.stamp_ns,
-        receive_ns=message.receive_ns,
+        stamp_ns=stamp_ns,
+        receive_ns=stamp_ns,
         x_m=x,
         y_m=y,
         z_m=z,
@@ -64,7 +84,7 @@ def decode_pointcloud2(message: PointCloud2) -> Cloud:
         ring=ring,
         return_no=_returns(table, names),
         time_ns=time_ns,
-        remark="; ".join(r for r in (*remarks, time_remark, ring_remark) if r),
+        remark="; ".join(r for r in (time_remark, ring_remark) if r),
     )
 
 
@@ -151,13 +171,16 @@ def _dtype(fields: tuple[PointField, ...], step: int, big: bool) -> np.dtype[Any
             names.append(field.name)
             formats.append(kind)
             offsets.append(field.offset)
-    missing = [axis for axis in "xyz" if axis not in {name.lower() for name in names}]
-    if missing:
-        raise InvalidInput(
-            f"field {missing[0]} is missing; the cloud has {', '.join(names) or 'no fields'}",
-            next_step="choose another topic: this one holds no 3D points",
-        )
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+
+
+def _need_xyz(names: dict[str, str]) -> None:
+    for axis in "xyz":
+        if axis not in names:
+            raise InvalidInput(
+                f"field {axis} is missing; the cloud has {', '.join(names.values()) or 'no fields'}",
+                next_step="choose another topic: this one holds no 3D points",
+            )
 
 
 def _column(table: NDArray[Any], name: str, dtype: Any) -> NDArray[Any]:
@@ -180,14 +203,14 @@ def _returns(table: NDArray[Any], names: dict[str, str]) -> NDArray[np.uint8]:
 
 
 def _rings(
-    table: NDArray[Any], names: dict[str, str], message: PointCloud2, *xyz: NDArray[np.float32]
+    table: NDArray[Any], names: dict[str, str], height: int, *xyz: NDArray[np.float32]
 ) -> tuple[NDArray[np.uint16], str]:
     """Beam numbers with 0 the lowest, from the ring field or from the rows of an organised cloud."""
     name = next((name for name in RING_NAMES if name in names), "")
     if name:
         ring = _column(table, names[name], np.uint16)
-    elif 4 <= message.height <= 256 and message.width >= 4:
-        ring = np.repeat(np.arange(message.height, dtype=np.uint16), message.width)
+    elif 4 <= height <= 256 and len(table) >= 4 * height:
+        ring = np.repeat(np.arange(height, dtype=np.uint16), len(table) // height)
     else:
         return np.zeros(len(table), np.uint16), ""
     sample = slice(None, None, max(1, len(table) // 2000))
