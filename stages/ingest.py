@@ -189,7 +189,7 @@ class _ScanMaker:
         """Time of every point, reference time (None: middle of the points' times), where they come from."""
         count = len(cloud.x_m)
         stamp_ns = cloud.receive_ns if self.settings.stamp_source == "receive" else cloud.stamp_ns
-        if self.settings.point_time == "none":
+        if self.settings.point_time == "none" or cloud.compensated:
             return np.full(count, stamp_ns, np.int64), stamp_ns, "none"
         if self.settings.point_time == "auto" and cloud.time_ns is not None:
             return cloud.time_ns + (stamp_ns - cloud.stamp_ns), None, "per point"

@@ -174,9 +174,9 @@ def read_velodyne(
 
 
 def read_compensated(path: Path, stamp_ns: int) -> Cloud:
-    """One scan of KITTI odometry: its points were already moved to the time of the stamp, and carry it."""
+    """One scan of KITTI odometry: its points were already moved to the time of the stamp."""
     cloud = read_velodyne(path, stamp_ns)
-    return replace(cloud, time_ns=np.full(len(cloud.x_m), stamp_ns, np.int64))
+    return replace(cloud, compensated=True)
 
 
 def read_oxts(log: RawLog, drive: str, problems: list[Problem]) -> Oxts:

@@ -45,6 +45,8 @@ class Cloud:
     """What `stamp_ns` names; used only where `time_ns` is None."""
     remark: str = ""
     """What the decoder found odd or had to guess (for instance `field time taken as seconds after the header`)."""
+    compensated: bool = False
+    """The points were moved to the time of the stamp before they were recorded (KITTI odometry); they have no own."""
     sweep: Sweep | None = None
     """How the LiDAR turned, where the format fixes it (KITTI); None when it is to be read from the points' order."""
 
