@@ -1,0 +1,146 @@
+"""The map from above: points splatted into pixels, coloured by height above ground, shaded by depth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.schemas.scans import PointClass
+from scanloom.schemas.tiles import Tile
+from scanloom.stages.geometry.kernels import kernel
+
+BACKGROUND = (13, 17, 23)
+_GROUND_CELL_M = 4.0
+_TALL_M = 9.0
+_RAMP = np.array(
+    [[38, 60, 92], [33, 113, 140], [42, 160, 134], [126, 196, 92], [236, 214, 96], [250, 236, 190]], float
+)
+"""Colours from the ground up to `_TALL_M`."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A north-up window on the map: lower left corner, size in pixels, metres per pixel."""
+
+    left_m: float
+    bottom_m: float
+    width: int
+    height: int
+    pixel_m: float
+
+    def pixels(self, xy_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Image coordinates (n, 2), x right and y down, of map coordinates (n, 2), m."""
+        x = (xy_m[:, 0] - self.left_m) / self.pixel_m
+        y = self.height - (xy_m[:, 1] - self.bottom_m) / self.pixel_m
+        return np.column_stack((x, y))
+
+
+def fit_view(low_m: Any, high_m: Any, margin_m: float, longest: int, finest_m: float) -> View:
+    """The view that shows a rectangle with a margin, `longest` pixels at most, `finest_m` per pixel at least."""
+    low, high = np.asarray(low_m, float) - margin_m, np.asarray(high_m, float) + margin_m
+    span = np.maximum(high - low, 1.0)
+    low = (low + high - span) / 2
+    # No narrower than 2 to 5, so that a straight drive is no thin strip.
+    wide = np.maximum(span, span.max() * 0.4)
+    low -= (wide - span) / 2
+    pixel_m = max(float(wide.max()) / longest, finest_m)
+    width, height = np.maximum(np.ceil(wide / pixel_m).astype(int), 16)
+    return View(float(low[0]), float(low[1]), int(width), int(height), pixel_m)
+
+
+def draw_map(tiles: Iterable[Tile], view: View) -> NDArray[np.uint8]:
+    """RGB image (height, width, 3) of the tiles; they are read one by one."""
+    top = np.full((view.height, view.width), -np.inf, np.float32)
+    bright = np.zeros((view.height, view.width), np.float32)
+    cell = max(_GROUND_CELL_M, view.pixel_m)
+    step = max(round(cell / view.pixel_m), 1)
+    low = np.full((view.height // step + 1, view.width // step + 1), np.inf, np.float32)
+    for tile in tiles:
+        left, bottom = tile.offset_m[0] - view.left_m, tile.offset_m[1] - view.bottom_m
+        _splat(
+            tile.x_m, tile.y_m, tile.z_m, tile.offset_m[2], tile.intensity, tile.class_, int(PointClass.GROUND),
+            left, bottom, view.pixel_m, step, top, bright, low,
+        )  # fmt: skip
+    if not np.isfinite(top).any():
+        return np.full((view.height, view.width, 3), BACKGROUND, np.uint8)
+    ground = _ground(low, step, top.shape)
+    above = np.where(np.isfinite(top), top - ground, 0.0).astype(np.float32)
+    return _shade(top, above, _stretch(bright, np.isfinite(top)), view.pixel_m)
+
+
+def _ground(low: NDArray[np.float32], step: int, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Height of the ground per pixel, from the lowest points of coarse cells, smoothed."""
+    from scipy import ndimage
+
+    known = np.isfinite(low)
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    filled = low[tuple(nearest)]
+    smooth = ndimage.gaussian_filter(ndimage.minimum_filter(filled, 3), 1.5)
+    fine = np.repeat(np.repeat(smooth, step, axis=0), step, axis=1)[: shape[0], : shape[1]]
+    return ndimage.uniform_filter(fine, step).astype(np.float32)
+
+
+def _stretch(bright: NDArray[np.float32], filled: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Intensity of ground spread over 0 to 1 between its 5th and 98th percentile."""
+    values = bright[filled & (bright > 0)][::7]
+    if len(values) < 100:
+        return np.full_like(bright, 0.4)
+    low, high = np.percentile(values, (5, 98))
+    out: NDArray[np.float32] = np.clip((bright - low) / max(high - low, 1e-6), 0, 1).astype(np.float32)
+    return out
+
+
+def _shade(
+    top: NDArray[np.float32], above: NDArray[np.float32], bright: NDArray[np.float32], pixel_m: float
+) -> NDArray[np.uint8]:
+    light = _depth_light(top, pixel_m)
+    place = np.clip(above / _TALL_M, 0, 1) * (len(_RAMP) - 1)
+    i = np.minimum(place.astype(int), len(_RAMP) - 2)
+    share = (place - i)[..., None]
+    colour = _RAMP[i] * (1 - share) + _RAMP[i + 1] * share
+    colour *= np.where(above < 0.4, 0.55 + 0.9 * bright, 1.0)[..., None] * light[..., None]
+    empty = ~np.isfinite(top)
+    colour[empty] = BACKGROUND
+    return np.clip(colour, 0, 255).astype(np.uint8)
+
+
+@kernel
+def _splat(xs, ys, zs, z0, intensity, classes, ground, left, bottom, pixel_m, step, top, bright, low):  # type: ignore[no-untyped-def]
+    height, width = top.shape
+    for i in range(len(xs)):
+        px = np.int64(np.floor((xs[i] + left) / pixel_m))
+        py = height - 1 - np.int64(np.floor((ys[i] + bottom) / pixel_m))
+        if px < 0 or px >= width or py < 0 or py >= height:
+            continue
+        z = zs[i] + z0
+        if z > top[py, px]:
+            top[py, px] = z
+        if classes[i] == ground and intensity[i] > bright[py, px]:
+            bright[py, px] = intensity[i]
+        if z < low[py // step, px // step]:
+            low[py // step, px // step] = z
+
+
+@kernel
+def _depth_light(top, pixel_m):  # type: ignore[no-untyped-def]
+    """Eye-dome lighting (Boucheny 2009): a pixel is darker the more its neighbours stand above it."""
+    height, width = top.shape
+    light = np.ones((height, width), np.float32)
+    for y in range(height):
+        for x in range(width):
+            if not np.isfinite(top[y, x]):
+                continue
+            shadow = 0.0
+            for reach in (1, 2):
+                for k in range(4):
+                    ny = y + (reach if k == 0 else (-reach if k == 1 else 0))
+                    nx = x + (reach if k == 2 else (-reach if k == 3 else 0))
+                    if 0 <= ny < height and 0 <= nx < width and np.isfinite(top[ny, nx]):
+                        rise = (top[ny, nx] - top[y, x]) / (reach * max(pixel_m, 0.2))
+                        shadow += min(max(rise, 0.0), 4.0)
+            light[y, x] = np.exp(-0.09 * shadow)
+    return light

@@ -1,0 +1,132 @@
+"""The verdict: one word, and every check behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+from scanloom.schemas.session import Session
+from scanloom.stages.report.figures import Figures, number
+
+Level = Literal["pass", "note", "warn", "fail"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing looked at: how it went, in a sentence."""
+
+    level: Level
+    text: str
+
+
+@dataclass(frozen=True)
+class Limits:
+    """From which value on a check warns, and fails."""
+
+    unreliable_warn: float
+    unreliable_fail: float
+    gnss_warn_m: float
+    gnss_fail_m: float
+    ate_warn_m: float
+    drift_warn_percent: float
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The word, its level, and the checks with the worst first."""
+
+    word: str
+    level: Level
+    checks: list[Check]
+
+
+_ORDER: dict[Level, int] = {"fail": 0, "warn": 1, "note": 2, "pass": 3}
+_WORDS: dict[Level, str] = {"fail": "Poor", "warn": "Fair", "note": "Good", "pass": "Good"}
+
+
+def judge(
+    limits: Limits, sessions: dict[str, Session], figures: Figures, gnss_median_m: dict[str, float | None]
+) -> Verdict:
+    """Run all checks; the worst of them gives the word."""
+    checks = [*_map_checks(limits, figures, gnss_median_m)]
+    for name, session in sessions.items():
+        checks += _session_checks(limits, name, session, figures, gnss_median_m.get(name))
+    checks.sort(key=lambda check: _ORDER[check.level])
+    worst = checks[0].level if checks else "fail"
+    return Verdict(_WORDS[worst], worst, checks)
+
+
+def _map_checks(limits: Limits, figures: Figures, gnss_median_m: dict[str, float | None]) -> Iterator[Check]:
+    points = figures.get("map.points") or 0
+    if not points:
+        yield Check("fail", "The map holds no points.")
+    accepted = figures.get("loops.accepted") or 0
+    precision = figures.get("loops.precision")
+    if precision is not None and precision < 1.0:
+        yield Check("fail", f"{100 * (1 - precision):.1f} % of the accepted loops are false.")
+    elif precision is not None:
+        yield Check("pass", f"All {number(accepted)} accepted loops are true.")
+    elif accepted:
+        yield Check("pass", f"{number(accepted)} loops hold the map together.")
+    georeferenced = bool(figures.get("fusion.georeferenced"))
+    if not georeferenced:
+        yield Check(
+            "note", "The map is not georeferenced: no usable GNSS. Coordinates start at the first scan."
+        )
+    if not georeferenced and not accepted:
+        yield Check("note", "Neither GNSS nor a loop bounds the drift: accuracy falls with distance driven.")
+
+
+def _session_checks(
+    limits: Limits, name: str, session: Session, figures: Figures, gnss_m: float | None
+) -> Iterator[Check]:
+    scans, unreliable = (
+        figures.get("odometry.scans", name),
+        figures.get("odometry.unreliable_scans", name) or 0.0,
+    )
+    if not scans:
+        yield Check("fail", f"{name}: no scan has a pose.")
+    else:
+        level = _level(unreliable / scans, limits.unreliable_warn, limits.unreliable_fail)
+        registered = f"{name}: {number(scans - unreliable)} of {number(scans)} scans registered"
+        bridged = f", {number(unreliable)} bridged by prediction" if unreliable else ""
+        yield Check(level, f"{registered}{bridged}.")
+    if gnss_m is not None:
+        level = _level(gnss_m, limits.gnss_warn_m, limits.gnss_fail_m)
+        yield Check(level, f"{name}: poses and GNSS agree to {gnss_m:.2f} m (median, horizontal).")
+    yield from _truth_checks(limits, name, figures)
+    yield from _input_checks(name, session)
+
+
+def _truth_checks(limits: Limits, name: str, figures: Figures) -> Iterator[Check]:
+    ate = figures.get("fusion.ate_rmse_m", name)
+    if ate is not None:
+        level = _level(ate, limits.ate_warn_m, 10 * limits.ate_warn_m)
+        yield Check(level, f"{name}: trajectory within {ate:.2f} m of truth (ATE, root mean square).")
+    drift = figures.get("odometry.kitti_t_rel_percent", name)
+    if drift is not None:
+        level = _level(drift, limits.drift_warn_percent, 5 * limits.drift_warn_percent)
+        yield Check(level, f"{name}: odometry drifts {drift:.2f} % of the distance driven.")
+
+
+def _input_checks(name: str, session: Session) -> Iterator[Check]:
+    if not session.complete:
+        yield Check("warn", f"{name}: the log is incomplete; only what could be read is mapped.")
+    errors = [problem for problem in session.problems if problem.severity == "error"]
+    warnings = [problem for problem in session.problems if problem.severity == "warning"]
+    if errors:
+        yield Check(
+            "warn",
+            f"{name}: {len(errors)} serious problem{'s' * (len(errors) > 1)} in the log: {errors[0].text}",
+        )
+    if warnings:
+        yield Check(
+            "note", f"{name}: {len(warnings)} warning{'s' * (len(warnings) > 1)} about the log, listed below."
+        )
+
+
+def _level(value: float, warn: float, fail: float) -> Level:
+    if value > fail:
+        return "fail"
+    return "warn" if value > warn else "pass"

@@ -1,0 +1,124 @@
+"""A small mapped street: every product that tiling, evaluation and report read, with exact truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from scanloom.schemas.loops import Loops
+from scanloom.schemas.product import Part, Parts
+from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
+from scanloom.schemas.session import Session
+from scanloom.schemas.tiles import Piece, Tile, TileFiles
+from scanloom.schemas.tracks import Gnss
+from scanloom.schemas.trajectory import Odometry, Poses, Truth
+from scanloom.stages.geometry.se3 import F8, inverse
+from scanloom.stages.tiling import tiles, tiling
+from scanloom.stages.tiling.pieces import Settings as TilingSettings
+from scanloom.stages.tiling.tiles import Settings as TilesSettings
+from tests.worlds import GROUND_Z_M
+
+START_NS = 1_700_000_000_000_000_000
+PERIOD_NS = 100_000_000
+
+
+def stamps(count: int) -> np.ndarray:
+    return START_NS + PERIOD_NS * np.arange(count)
+
+
+def labels_of(scans: Sequence[DeskewedScan], T: F8) -> list[ScanLabels]:
+    """Ground by height of the true point, everything else static."""
+    labels = []
+    for scan, pose in zip(scans, T):
+        z = scan.points() @ pose[2, :3] + pose[2, 3]
+        classes = np.where(z < GROUND_Z_M + 0.15, PointClass.GROUND, PointClass.STATIC).astype(np.uint8)
+        labels.append(ScanLabels(class_=classes, reference_ns=scan.reference_ns, scan_index=scan.scan_index))
+    return labels
+
+
+def poses_of(T: F8, *, georeference: dict[str, Any] | None = None) -> Poses:
+    n = len(T)
+    return Poses(
+        scan_index=np.arange(n), stamp_ns=stamps(n), T_world_lidar=T, covariance=np.tile(np.eye(6) * 1e-4, (n, 1, 1)),
+        keyframe=np.ones(n, bool), frame="world" if georeference else "map", georeference=georeference,
+    )  # fmt: skip
+
+
+def odometry_of(T: F8, *, reliable: np.ndarray | None = None) -> Odometry:
+    n = len(T)
+    one = np.ones(n)
+    return Odometry(
+        scan_index=np.arange(n), stamp_ns=stamps(n), T_odom_lidar=T, covariance=np.tile(np.eye(6) * 1e-4, (n, 1, 1)),
+        inlier_ratio=one, rmse_m=one * 0.02, degeneracy_d=one, degeneracy_e=one * 0.01, direction_p=np.ones((n, 6)),
+        weak_directions=np.tile(np.eye(6), (n, 1, 1)), keyframe=np.ones(n, bool),
+        reliable=np.ones(n, bool) if reliable is None else reliable,
+    )  # fmt: skip
+
+
+def truth_of(T: F8) -> Truth:
+    return Truth(stamp_ns=stamps(len(T)), T_truth_lidar=T, source="analytic")
+
+
+def loops_of(T: F8, pairs: Sequence[tuple[int, int]], errors_m: Sequence[float], session: str = "a") -> Loops:
+    """Accepted loops between scans of one session, each wrong by so many metres along x."""
+    i, j = (np.array([pair[k] for pair in pairs], np.int64) for k in (0, 1))
+    T_i_j = inverse(T[i]) @ T[j]
+    T_i_j[:, 0, 3] += errors_m
+    n = len(pairs)
+    names = np.array([session] * n, object)
+    return Loops(
+        session_i=names, scan_i=i, session_j=names, scan_j=j, T_i_j=T_i_j, covariance=np.tile(np.eye(6), (n, 1, 1)),
+        descriptor_distance=np.full(n, 0.1), inlier_ratio=np.full(n, 0.9), rmse_m=np.full(n, 0.05), overlap=np.full(n, 0.8),
+        accepted=np.ones(n, bool), reason=np.array(["verified"] * n, object),
+    )  # fmt: skip
+
+
+def session_of(name: str = "a", scans: int = 10, **changes: Any) -> Session:
+    fields: dict[str, Any] = {
+        "name": name, "format": "mcap", "start_ns": START_NS, "end_ns": START_NS + scans * PERIOD_NS, "scan_count": scans,
+        "point_count": scans * 1000, "scan_rate_hz": 10.0, "beams": 16, "point_time": "per point", "topics": (),
+        "extrinsics": (), "problems": (), "complete": True,
+    }  # fmt: skip
+    return Session(**{**fields, **changes})
+
+
+def one(product: Any, session: str = "a") -> Parts[Any]:
+    """A product of one session, as a map stage gets it."""
+    return Parts([((("session", session),), product)])
+
+
+def no_gnss() -> Gnss:
+    return Gnss.empty()
+
+
+def pieces_of(
+    scans: Sequence[DeskewedScan], T: F8, settings: TilingSettings | None = None, poses: Poses | None = None
+) -> list[Part[Piece]]:
+    labels = Labels(labels_of(scans, T))
+    return list(tiling(settings or TilingSettings(), Deskewed(scans), labels, poses or poses_of(T)))
+
+
+@dataclass(frozen=True)
+class Source:
+    """Pieces of one chunk of a session."""
+
+    session: str
+    chunk: str
+    pieces: list[Part[Piece]]
+
+
+def tiles_of(sources: Sequence[Source], settings: TilesSettings | None = None) -> dict[str, tuple[Tile, TileFiles]]:
+    """Merge the pieces tile by tile, as the engine does."""
+    found: dict[str, list[Any]] = {}
+    for source in sources:
+        for part in source.pieces:
+            where = (("session", source.session), ("chunk", source.chunk), ("tile", part.key))
+            found.setdefault(part.key, []).append((where, part.product))
+    return {name: tiles(settings or TilesSettings(), Parts(parts)) for name, parts in sorted(found.items())}
+
+
+def tile_parts(made: dict[str, tuple[Tile, TileFiles]]) -> Parts[Tile]:
+    return Parts([((("tile", name),), tile) for name, (tile, _) in made.items()])
