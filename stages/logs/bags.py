@@ -16,6 +16,7 @@ from scanloom.stages.logs.containers import Container
 from scanloom.stages.logs.mcap import McapFile
 from scanloom.stages.logs.messages import decode, kind_of, ros2_name
 from scanloom.stages.logs.records import Damage, Message, TopicInfo
+from scanloom.stages.logs.rosbag import Rosbag1File
 
 _ENCODINGS = ("cdr", "ros1")
 
@@ -151,4 +152,6 @@ def open_bags(raw_log: RawLog, format: str) -> BagLog:
 def _opener(name: str) -> Callable[[Path], Container] | None:
     if name.endswith((".mcap", ".mcap.zstd")):
         return McapFile
+    if name.endswith((".bag", ".active")):
+        return Rosbag1File
     return None

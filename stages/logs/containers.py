@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import bz2
 import mmap
+import struct
+import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -47,8 +50,19 @@ class Block:
     """Messages that are read together: a chunk, or a run of loose messages."""
 
     start_ns: int
-    offset: int
-    stamps: dict[int, NDArray[np.int64]]
+    begin: int
+    end: int
+    """Where the (compressed) data stands in the file."""
+    compression: str
+    size: int
+    """Declared size of the data when decompressed."""
+    crc: int = 0
+    """CRC-32 of the decompressed data; 0 when not given."""
+    cut: bool = False
+    """The file ends before the data does."""
+    loose: bool = False
+    """Messages that stand in the file itself, in no chunk."""
+    stamps: dict[int, NDArray[np.int64]] = field(default_factory=dict)
     """Receive times per channel, as the index tells."""
 
 
@@ -67,6 +81,87 @@ class Container(Protocol):
 
     def read(self, channels: set[int]) -> Iterator[RawMessage]:
         """Messages of the channels in order of receive time."""
+
+
+class ChunkedFile:
+    """A file of chunks of messages: what MCAP and rosbag1 have in common.
+
+    A subclass walks the records of the file once (`_walk`) and splits a chunk into messages (`_records`). Chunks whose
+    index tells their times and channels are not decompressed before they are read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.damage = Damage()
+        self.channels: dict[int, Channel] = {}
+        self._bytes = map_file(path)
+        self._blocks: list[Block] = []
+        self._check_start()
+        self._walk()
+        self._index_unindexed()
+        self._blocks = sorted((b for b in self._blocks if b.stamps), key=lambda block: block.start_ns)
+        self._stamps = merge_stamps(self._blocks)
+
+    @property
+    def stamps(self) -> dict[int, NDArray[np.int64]]:
+        """Receive times of all messages, per channel."""
+        return self._stamps
+
+    def read(self, channels: set[int]) -> Iterator[RawMessage]:
+        """Messages of the channels in order of receive time; at most the chunks that overlap are in memory."""
+        wanted = [block for block in self._blocks if not channels.isdisjoint(block.stamps)]
+        return in_time_order((block.start_ns, partial(self._load, block, channels)) for block in wanted)
+
+    def _check_start(self) -> None:
+        """Raises InvalidInput when the file is of another kind."""
+        raise NotImplementedError
+
+    def _walk(self) -> None:
+        """Fill `_blocks` and `channels`; note damage."""
+        raise NotImplementedError
+
+    def _records(self, data: memoryview, block: Block, channels: set[int] | None) -> Iterator[RawMessage]:
+        """Messages in the data of one block; with `channels` None all of them, and declarations are taken in."""
+        raise NotImplementedError
+
+    def _lose(self, text: str, lost_bytes: int) -> None:
+        self.damage.texts.append(text)
+        self.damage.lost_bytes += lost_bytes
+
+    def _index_unindexed(self) -> None:
+        """Look inside chunks whose index is missing, or whose channels are declared only inside."""
+        for block in self._blocks:
+            known = all(channel in self.channels for channel in block.stamps)
+            if block.loose or (known and block.stamps and not block.cut):
+                continue
+            stamps = StampLists()
+            for message in self._messages(block, None):
+                stamps.add(message.channel, message.receive_ns)
+            if not block.stamps:
+                block.stamps = stamps.arrays()
+                block.start_ns = min(
+                    (int(values.min()) for values in block.stamps.values()), default=block.start_ns
+                )
+
+    def _load(self, block: Block, channels: set[int]) -> list[RawMessage]:
+        return [message for message in self._messages(block, channels) if message.channel in self.channels]
+
+    def _messages(self, block: Block, channels: set[int] | None) -> Iterator[RawMessage]:
+        try:
+            yield from self._records(memoryview(self._open(block)), block, channels)
+        except (DamageError, struct.error, ValueError, OverflowError) as error:
+            text = f"a part of {(block.end - block.begin) / 1e6:.2g} MB at {block.begin / 1e6:.1f} MB is lost: {error}"
+            if text not in self.damage.texts and not block.cut:
+                self._lose(text, block.end - block.begin)
+
+    def _open(self, block: Block) -> bytes | memoryview:
+        data = self._bytes[block.begin : block.end]
+        if block.loose:
+            return data
+        out = decompress(block.compression, data, block.size, cut=block.cut)
+        if block.crc and not block.cut and zlib.crc32(out) != block.crc:
+            raise DamageError("the checksum of the chunk is wrong")
+        return out
 
 
 def map_file(path: Path) -> memoryview:
@@ -125,10 +220,44 @@ class StampLists:
         return {channel: np.array(values, np.int64) for channel, values in self.lists.items()}
 
 
-def decompress(compression: str, data: memoryview, size: int, *, partial: bool = False) -> bytes | memoryview:
+class LooseRun:
+    """A run of messages outside chunks, on its way to become a block."""
+
+    LENGTH = 4096
+
+    def __init__(self) -> None:
+        self._begin = self._end = self._count = 0
+        self._stamps = StampLists()
+
+    @property
+    def full(self) -> bool:
+        return self._count >= self.LENGTH
+
+    def add(self, channel: int, stamp_ns: int, begin: int, end: int) -> None:
+        """A message whose record stands at `begin` to `end` of the file."""
+        if not self._count:
+            self._begin = begin
+        self._stamps.add(channel, stamp_ns)
+        self._end = end
+        self._count += 1
+
+    def take(self) -> list[Block]:
+        """The run as a block, none when it is empty; a new run begins."""
+        if not self._count:
+            return []
+        stamps = self._stamps.arrays()
+        start_ns = min(int(values.min()) for values in stamps.values())
+        block = Block(
+            start_ns, self._begin, self._end, "", self._end - self._begin, loose=True, stamps=stamps
+        )
+        self._count, self._stamps = 0, StampLists()
+        return [block]
+
+
+def decompress(compression: str, data: memoryview, size: int, *, cut: bool = False) -> bytes | memoryview:
     """Bytes of a chunk. Never makes more than `size` bytes, whatever the compressed data claims.
 
-    With `partial` the data may end early, and what can be had of it is returned.
+    With `cut` the data may end early, and what can be had of it is returned.
 
     Raises
     ------
@@ -146,7 +275,7 @@ def decompress(compression: str, data: memoryview, size: int, *, partial: bool =
         raise
     except Exception as error:  # the three libraries have no common base
         raise DamageError(f"a chunk cannot be decompressed ({error})") from error
-    if len(out) != size and not partial:
+    if len(out) != size and not cut:
         raise DamageError(f"a chunk has {len(out)} bytes where {size} are declared")
     return out
 
