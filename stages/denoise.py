@@ -35,7 +35,7 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    min_range_m: float = Field(1.0, ge=0.0, le=20.0, description="nearer points are out of range, m")
+    min_range_m: float = Field(2.0, ge=0.0, le=20.0, description="nearer points are out of range, m")
     max_range_m: float = Field(100.0, ge=1.0, le=1000.0, description="farther points are out of range, m")
     ego_low_m: Corner = Field(
         (-1.5, -0.9, -2.0), description="lower corner of the own vehicle in the base frame, m"

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.schemas.scans import DeskewedScan, Scan
-from scanloom.stages.geometry.se3 import F8, inverse, pose, so3_exp
+from scanloom.stages.geometry.se3 import F8, inverse, pose, se3_exp, so3_exp
 
 GROUND_Z_M = -1.8
 
@@ -82,7 +82,7 @@ def sweep(
     rays = beams(rows, columns)
     column = np.arange(len(rays)) // rows
     dt = (column / columns - 0.5) * period_s
-    T = T_world_lidar @ pose(so3_exp(dt[:, None] * twist[:3]), dt[:, None] * twist[3:])
+    T = T_world_lidar @ se3_exp(dt[:, None] * twist)
     ranges = world.ranges(T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], rays))
     if rng is not None:
         ranges = ranges + rng.normal(0, noise_m, len(ranges))
