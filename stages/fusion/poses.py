@@ -261,12 +261,12 @@ def _poses(d: Drive, solution: Solution, covariance: F8, origin: Georeference | 
 
 def _spread(d: Drive, T_keyframes: F8) -> F8:
     """T = T_a (O_a^-1 O) Exp(s xi), with xi what the motion to the next keyframe lacks and s the share of time."""
-    O, rows = d.odometry.T_odom_lidar, d.keyframes
-    every = np.arange(len(O))
+    odom, rows = d.odometry.T_odom_lidar, d.keyframes
+    every = np.arange(len(odom))
     a = np.clip(np.searchsorted(rows, every, side="right") - 1, 0, len(rows) - 1)
-    T = T_keyframes[a] @ inverse(O[rows[a]]) @ O
+    T = T_keyframes[a] @ inverse(odom[rows[a]]) @ odom
     if len(rows) > 1:
-        xi = se3_log(inverse(T_keyframes[:-1] @ inverse(O[rows[:-1]]) @ O[rows[1:]]) @ T_keyframes[1:])
+        xi = se3_log(inverse(T_keyframes[:-1] @ inverse(odom[rows[:-1]]) @ odom[rows[1:]]) @ T_keyframes[1:])
         at = np.minimum(a, len(rows) - 2)
         stamp = d.odometry.stamp_ns
         span = np.maximum(stamp[rows[at + 1]] - stamp[rows[at]], 1)

@@ -1,0 +1,1 @@
+"""Places seen again: descriptors, candidates, verification."""
