@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,10 @@ from numpy.typing import NDArray
 from scanloom.schemas.errors import InvalidInput
 from scanloom.schemas.session import Extrinsic, Problem, RawLog
 from scanloom.stages.logs.containers import Container
+from scanloom.stages.logs.database import DatabaseFile
 from scanloom.stages.logs.mcap import McapFile
 from scanloom.stages.logs.messages import decode, kind_of, ros2_name
+from scanloom.stages.logs.packed import PackedFile
 from scanloom.stages.logs.records import Damage, Message, TopicInfo
 from scanloom.stages.logs.rosbag import Rosbag1File
 
@@ -150,8 +153,15 @@ def open_bags(raw_log: RawLog, format: str) -> BagLog:
 
 
 def _opener(name: str) -> Callable[[Path], Container] | None:
-    if name.endswith((".mcap", ".mcap.zstd")):
-        return McapFile
-    if name.endswith((".bag", ".active")):
-        return Rosbag1File
-    return None
+    if name.endswith(".zstd"):
+        inner = _opener(name.removesuffix(".zstd"))
+        return partial(PackedFile, inner=inner) if inner else None
+    return _OPENERS.get(Path(name).suffix)
+
+
+_OPENERS: dict[str, Callable[[Path], Container]] = {
+    ".mcap": McapFile,
+    ".bag": Rosbag1File,
+    ".active": Rosbag1File,
+    ".db3": DatabaseFile,
+}

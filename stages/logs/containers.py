@@ -280,7 +280,8 @@ def decompress(compression: str, data: memoryview, size: int, *, cut: bool = Fal
     return out
 
 
-def _zstd(data: memoryview, size: int) -> bytes:
+def decompress_zstd(data: memoryview, size: int) -> bytes:
+    """At most `size` bytes."""
     import zstandard
 
     reader = zstandard.ZstdDecompressor(max_window_size=1 << 30).stream_reader(data)
@@ -312,4 +313,4 @@ def _bounded(read: Callable[[int], bytes], size: int) -> bytes:
     return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
 
-_INFLATE: dict[str, Callable[[memoryview, int], bytes]] = {"zstd": _zstd, "lz4": _lz4, "bz2": _bz2}
+_INFLATE: dict[str, Callable[[memoryview, int], bytes]] = {"zstd": decompress_zstd, "lz4": _lz4, "bz2": _bz2}

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from scanloom.stages.geometry.se3 import F8, matrix_from_quaternion, pose
+from scanloom.stages.logs.containers import MAX_MESSAGE_BYTES, decompress_zstd
 from scanloom.stages.logs.records import (
     LIVOX_POINT,
     Body,
@@ -243,9 +244,29 @@ def kind_of(type_name: str) -> Kind:
 def decode(data: memoryview, type_name: str, encoding: str, topic: str, receive_ns: int) -> Body:
     """One message; `encoding` is `cdr` or `ros1`. Bytes that do not fit the type give `Undecodable`."""
     try:
+        if encoding == "cdr" and bytes(data[:4]) == _ZSTD:
+            data = _unpacked(data)
         body = _DECODERS[_short(type_name)][1](Cursor(data, encoding), receive_ns)
     except (ValueError, OverflowError) as error:
         return Undecodable(receive_ns, receive_ns, str(error))
     if isinstance(body, Transforms) and topic.rstrip("/").endswith("tf_static"):
         return Transforms(body.stamp_ns, body.receive_ns, body.transforms, static=True)
     return body
+
+
+_ZSTD = b"\x28\xb5\x2f\xfd"
+"""Begins a message that rosbag2 compressed; no CDR message begins so."""
+
+
+def _unpacked(data: memoryview) -> memoryview:
+    import zstandard
+
+    try:
+        size = zstandard.get_frame_parameters(data).content_size
+        if size == zstandard.CONTENTSIZE_UNKNOWN:
+            size = MAX_MESSAGE_BYTES
+        if size > MAX_MESSAGE_BYTES:
+            raise ValueError(f"a compressed message claims {size / 2**20:.0f} MiB")
+        return memoryview(decompress_zstd(data, size))
+    except (zstandard.ZstdError, MemoryError) as error:
+        raise ValueError(f"a compressed message cannot be unpacked ({error})") from error
