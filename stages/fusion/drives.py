@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.schemas.errors import StageError
-from scanloom.schemas.product import Parts
+from scanloom.schemas.product import Parts, ProductT
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Gnss, Imu
 from scanloom.schemas.trajectory import Odometry
@@ -52,7 +52,7 @@ class Drive:
 
     @cached_property
     def T_lidar_imu(self) -> F8:
-        return inverse(self.T_base_lidar) @ np.array(self.session.T_base("imu"))
+        return np.asarray(inverse(self.T_base_lidar) @ np.array(self.session.T_base("imu")))
 
     @cached_property
     def antenna_m(self) -> F8:
@@ -122,7 +122,7 @@ class Drive:
 def _trusted(covariance: F8) -> F8:
     """Covariances with the unknown ones (not finite, or negative on the diagonal) replaced by a wide guess."""
     diagonal = np.diagonal(covariance, axis1=1, axis2=2)
-    good = np.isfinite(covariance).all(axis=(1, 2)) & (diagonal >= 0).all(axis=1)
+    good = np.asarray(np.isfinite(covariance).all(axis=(1, 2)) & (diagonal >= 0).all(axis=1))
     wide = np.diag(np.repeat(UNKNOWN_STEP_SIGMA, 3) ** 2)
     return np.where(good[:, None, None], covariance, wide)
 
@@ -136,13 +136,10 @@ def gather(
     ------
     StageError : a session has no odometry.
     """
-    by_name = [
-        {where.get("session", ""): part for where, part in parts.items()}
-        for parts in (session, odometry, gnss, imu)
-    ]
+    tracks, fixes, inertial = _by_session(odometry), _by_session(gnss), _by_session(imu)
     first_node = 0
-    for name, document in by_name[0].items():
-        track = by_name[1].get(name)
+    for name, document in _by_session(session).items():
+        track = tracks.get(name)
         if track is None or len(track) == 0:
             raise StageError(
                 "odometry has no pose to fuse",
@@ -151,9 +148,18 @@ def gather(
             )
         keyframes = np.flatnonzero(track.keyframe).astype(np.int64)
         if not len(keyframes):
-            keyframes = np.array([0, len(track) - 1][: len(track)], np.int64)
+            keyframes = np.unique([0, len(track) - 1]).astype(np.int64)
         yield Drive(
-            name, document, track, by_name[2].get(name, Gnss.empty()), by_name[3].get(name, Imu.empty()),
-            first_node, keyframes,
-        )  # fmt: skip
+            name,
+            document,
+            track,
+            fixes.get(name, Gnss.empty()),
+            inertial.get(name, Imu.empty()),
+            first_node,
+            keyframes,
+        )
         first_node += len(keyframes)
+
+
+def _by_session(parts: Parts[ProductT]) -> dict[str, ProductT]:
+    return {where.get("session", ""): part for where, part in parts.items()}

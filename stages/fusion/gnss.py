@@ -30,38 +30,44 @@ class GnssSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     max_sigma_m: float = Field(
-        5.0, gt=0, le=100, description="fixes with a larger horizontal standard deviation are left out, m"
+        default=5.0,
+        gt=0,
+        le=100,
+        description="fixes with a larger horizontal standard deviation are left out, m",
     )
     unknown_sigma_m: float = Field(
-        3.0, gt=0, le=100, description="horizontal standard deviation where the receiver gives none, m"
+        default=3.0,
+        gt=0,
+        le=100,
+        description="horizontal standard deviation where the receiver gives none, m",
     )
     min_sigma_m: float = Field(
-        0.05, gt=0, le=10, description="smallest horizontal standard deviation that is believed, m"
+        default=0.05, gt=0, le=10, description="smallest horizontal standard deviation that is believed, m"
     )
     inflation: float = Field(
-        2.0, ge=1, le=10, description="factor on standard deviations; fixes share errors over time"
+        default=2.0, ge=1, le=10, description="factor on standard deviations; fixes share errors over time"
     )
     min_satellites: int = Field(
-        0, ge=0, le=50, description="fewer satellites: left out; logs that do not tell pass"
+        default=0, ge=0, le=50, description="fewer satellites: left out; logs that do not tell pass"
     )
     outage_s: float = Field(
-        2.0, gt=0, le=600, description="a pause this long without good fixes is an outage, s"
+        default=2.0, gt=0, le=600, description="a pause this long without good fixes is an outage, s"
     )
     recovery_s: float = Field(
-        5.0, ge=0, le=600, description="good fixes needed after an outage before one is used, s"
+        default=5.0, ge=0, le=600, description="good fixes needed after an outage before one is used, s"
     )
     motion_tolerance_m: float = Field(
-        0.3, gt=0, le=10, description="disagreement with odometry always allowed, m"
+        default=0.3, gt=0, le=10, description="disagreement with odometry always allowed, m"
     )
     motion_drift: float = Field(
-        0.04, gt=0, le=1, description="disagreement with odometry allowed per metre driven"
+        default=0.04, gt=0, le=1, description="disagreement with odometry allowed per metre driven"
     )
     chain_m: float = Field(
-        400.0, gt=10, le=1e5, description="farthest path over which two fixes are compared, m"
+        default=400.0, gt=10, le=1e5, description="farthest path over which two fixes are compared, m"
     )
-    spacing_m: float = Field(5.0, ge=0, le=1000, description="one fix is used per this much path, m")
+    spacing_m: float = Field(default=5.0, ge=0, le=1000, description="one fix is used per this much path, m")
     max_heading_sigma_deg: float = Field(
-        8.0, gt=0, le=90, description="heading less certain than this: no georeference, deg"
+        default=8.0, gt=0, le=90, description="heading less certain than this: no georeference, deg"
     )
 
 
@@ -101,14 +107,11 @@ def screen(settings: GnssSettings, drive: Drive) -> Texts:
 
 def receiver_sigma(settings: GnssSettings, gnss: Gnss) -> F8:
     """Standard deviations (n, 3) east, north, up as the receiver gives them; a guess where it does not, m."""
-    variance = np.diagonal(gnss.covariance_m2, axis1=1, axis2=2).copy()
-    told = np.isfinite(variance).all(axis=1) & (variance[:, :2] > 0).all(axis=1)
+    variance: F8 = np.diagonal(gnss.covariance_m2, axis1=1, axis2=2)
+    variance = np.where(np.isfinite(variance), variance, -1.0)
+    told = (variance[:, 0] > 0) & (variance[:, 1] > 0) & (variance[:, 2] >= 0)
     guess = np.array([1.0, 1.0, 2.0]) * settings.unknown_sigma_m
-    return np.where(
-        told[:, None],
-        np.sqrt(np.maximum(variance, 0.0, where=told[:, None], out=np.zeros_like(variance))),
-        guess,
-    )
+    return np.where(told[:, None], np.sqrt(np.maximum(variance, 0.0)), guess)
 
 
 def judge(

@@ -5,7 +5,7 @@ Batch pose graph over keyframes (methods 1.8 to 1.10). Every factor, used or not
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -36,36 +36,39 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     odometry_rotation_deg_sqrt_m: float = Field(
-        0.05,
+        default=0.05,
         gt=0,
         le=10,
         description="random walk of odometry's rotation added per root of distance, deg/sqrt(m)",
     )
     odometry_translation_m_sqrt_m: float = Field(
-        0.02,
+        default=0.02,
         gt=0,
         le=10,
         description="random walk of odometry's translation added per root of distance, m/sqrt(m)",
     )
     gravity_sigma_deg: float = Field(
-        1.5, gt=0, le=45, description="standard deviation of a measured up direction, deg"
+        default=1.5, gt=0, le=45, description="standard deviation of a measured up direction, deg"
     )
     assumed_level_sigma_deg: float = Field(
-        4.0,
+        default=4.0,
         gt=0,
         le=45,
         description="standard deviation of `the vehicle stands level` when there is no IMU, deg",
     )
     gravity_spacing_m: float = Field(
-        10.0, gt=0, le=1000, description="one gravity factor per this much path, m"
+        default=10.0, gt=0, le=1000, description="one gravity factor per this much path, m"
     )
     loop_inflation: float = Field(
-        1.0, ge=0.1, le=100, description="factor on the standard deviations of loops"
+        default=1.0, ge=0.1, le=100, description="factor on the standard deviations of loops"
     )
     inlier_probability: float = Field(
-        0.999, gt=0.5, lt=1, description="chi-square probability up to which a loop or fix is an inlier"
+        default=0.999,
+        gt=0.5,
+        lt=1,
+        description="chi-square probability up to which a loop or fix is an inlier",
     )
-    gnss: GnssSettings = Field(GnssSettings(), description="gates and weights of GNSS")
+    gnss: GnssSettings = Field(default_factory=GnssSettings, description="gates and weights of GNSS")
 
 
 def fusion(
@@ -276,7 +279,7 @@ def _spread(d: Drive, T_keyframes: F8) -> F8:
     return np.asarray(T)
 
 
-def _key(drives: Sequence[Drive]):  # type: ignore[no-untyped-def]
+def _key(drives: Sequence[Drive]) -> Callable[[int], str]:
     starts = np.array([d.first_node for d in drives])
 
     def name(node: int) -> str:

@@ -32,28 +32,28 @@ class CandidateSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     min_path_m: float = Field(
-        50.0, gt=0, le=1e4, description="path between two passes of one session, at least, m"
+        default=50.0, gt=0, le=1e4, description="path between two passes of one session, at least, m"
     )
     min_time_s: float = Field(
-        30.0, ge=0, le=1e4, description="time between two passes of one session, at least, s"
+        default=30.0, ge=0, le=1e4, description="time between two passes of one session, at least, s"
     )
-    query_spacing_m: float = Field(2.0, gt=0, le=100, description="one search per this much path, m")
-    neighbours: int = Field(10, ge=1, le=100, description="ring keys compared in full per search")
+    query_spacing_m: float = Field(default=2.0, gt=0, le=100, description="one search per this much path, m")
+    neighbours: int = Field(default=10, ge=1, le=100, description="ring keys compared in full per search")
     max_descriptor_distance: float = Field(
-        0.45, gt=0, le=1, description="less alike places are no candidates"
+        default=0.45, gt=0, le=1, description="less alike places are no candidates"
     )
     radius_m: float = Field(
-        12.0, gt=0, le=200, description="odometry positions closer than this are candidates, m"
+        default=12.0, gt=0, le=200, description="odometry positions closer than this are candidates, m"
     )
     radius_growth: float = Field(
-        0.02, ge=0, le=0.5, description="growth of that radius per metre driven in between"
+        default=0.02, ge=0, le=0.5, description="growth of that radius per metre driven in between"
     )
-    max_radius_m: float = Field(30.0, gt=0, le=500, description="largest such radius, m")
+    max_radius_m: float = Field(default=30.0, gt=0, le=500, description="largest such radius, m")
     spacing_m: float = Field(
-        10.0, gt=0, le=1000, description="no two candidates are closer than this on both passes, m"
+        default=10.0, gt=0, le=1000, description="no two candidates are closer than this on both passes, m"
     )
     max_candidates: int = Field(
-        400, ge=1, le=100000, description="most candidates that are verified, the best first"
+        default=400, ge=1, le=100000, description="most candidates that are verified, the best first"
     )
 
 
@@ -209,7 +209,7 @@ def _by_descriptor(settings: CandidateSettings, tracks: Sequence[Track]) -> list
                 continue
             best, distance, shift = _search(
                 keys[a], units[a], tracks[a].stamp_ns, tracks[a].travelled_m, keys[b], units[b], track.stamp_ns,
-                track.travelled_m, queries, a == b, settings.min_path_m, np.int64(settings.min_time_s * 1e9),
+                track.travelled_m, queries, a == b, settings.min_path_m, int(settings.min_time_s * 1e9),
                 settings.neighbours,
             )  # fmt: skip
             for k in np.flatnonzero((best >= 0) & (distance <= settings.max_descriptor_distance)):

@@ -26,10 +26,16 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    candidates: CandidateSettings = Field(CandidateSettings(), description="where loops are looked for")
-    submaps: SubmapSettings = Field(SubmapSettings(), description="what is compared")
-    verification: VerificationSettings = Field(VerificationSettings(), description="what a loop must pass")
-    consistency: ConsistencySettings = Field(ConsistencySettings(), description="how loops must agree")
+    candidates: CandidateSettings = Field(
+        default_factory=CandidateSettings, description="where loops are looked for"
+    )
+    submaps: SubmapSettings = Field(default_factory=SubmapSettings, description="what is compared")
+    verification: VerificationSettings = Field(
+        default_factory=VerificationSettings, description="what a loop must pass"
+    )
+    consistency: ConsistencySettings = Field(
+        default_factory=ConsistencySettings, description="how loops must agree"
+    )
 
 
 def loops(

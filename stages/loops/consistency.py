@@ -19,18 +19,21 @@ class ConsistencySettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     reach_m: float = Field(
-        150.0, gt=0, le=1e5, description="loops farther apart than this on either pass are not compared, m"
+        default=150.0,
+        gt=0,
+        le=1e5,
+        description="loops farther apart than this on either pass are not compared, m",
     )
-    tolerance_m: float = Field(0.5, gt=0, le=50, description="misclosure always allowed, m")
-    tolerance_deg: float = Field(2.0, gt=0, le=90, description="misclosure always allowed, deg")
+    tolerance_m: float = Field(default=0.5, gt=0, le=50, description="misclosure always allowed, m")
+    tolerance_deg: float = Field(default=2.0, gt=0, le=90, description="misclosure always allowed, deg")
     drift_share: float = Field(
-        0.02, gt=0, le=1, description="misclosure allowed per metre of odometry in the cycle"
+        default=0.02, gt=0, le=1, description="misclosure allowed per metre of odometry in the cycle"
     )
     drift_deg_m: float = Field(
-        0.03, gt=0, le=10, description="misclosure allowed per metre of odometry in the cycle, deg/m"
+        default=0.03, gt=0, le=10, description="misclosure allowed per metre of odometry in the cycle, deg/m"
     )
     trusted_path_m: float = Field(
-        600.0,
+        default=600.0,
         ge=0,
         le=1e5,
         description="a lone loop after at most this much path may be confirmed by odometry itself, m",
@@ -63,7 +66,7 @@ def inconsistent(
         alive[worst] = False
         gone[int(worst)] = "contradicts another loop through odometry"
     for k in np.flatnonzero(alive):
-        if not (pairs.agree[k] & alive).any() and not _odometry_agrees(settings, tracks, *loops[k]):
+        if not (pairs.agree[k] & alive).any() and not _odometry_agrees(settings, tracks, *loops[int(k)]):
             gone[int(k)] = "no other loop confirms it"
     return gone
 

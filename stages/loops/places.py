@@ -25,9 +25,9 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    max_radius_m: float = Field(80.0, gt=5, le=500, description="radius of the outermost ring, m")
+    max_radius_m: float = Field(default=80.0, gt=5, le=500, description="radius of the outermost ring, m")
     height_offset_m: float = Field(
-        2.5,
+        default=2.5,
         ge=0,
         le=20,
         description="added to heights so that the ground is not below zero: the LiDAR's height or more, m",
@@ -61,8 +61,8 @@ def scan_context(scan: DeskewedScan, label: ScanLabels, settings: Settings) -> N
     """Highest point (20, 60), m above the offset, per ring of max_radius/20 and sector of 6 degrees; empty bins are 0."""
     out = np.zeros((RINGS, SECTORS), np.float32)
     _highest(
-        scan.x_m, scan.y_m, scan.z_m, label.class_, np.float32(settings.max_radius_m),
-        np.float32(settings.height_offset_m), out,
+        scan.x_m, scan.y_m, scan.z_m, label.class_, settings.max_radius_m,
+        settings.height_offset_m, out,
     )  # fmt: skip
     return out
 

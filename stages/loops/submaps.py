@@ -26,13 +26,13 @@ class SubmapSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    reach_m: float = Field(12.0, ge=0, le=200, description="path before and after the keyframe, m")
-    step_m: float = Field(3.0, gt=0, le=100, description="one scan per this much path, m")
+    reach_m: float = Field(default=12.0, ge=0, le=200, description="path before and after the keyframe, m")
+    step_m: float = Field(default=3.0, gt=0, le=100, description="one scan per this much path, m")
     max_range_m: float = Field(
-        45.0, gt=5, le=300, description="points farther from their LiDAR are left out, m"
+        default=45.0, gt=5, le=300, description="points farther from their LiDAR are left out, m"
     )
     voxel_size_m: float = Field(
-        0.3, gt=0.05, le=5, description="points are thinned to one per voxel of this size, m"
+        default=0.3, gt=0.05, le=5, description="points are thinned to one per voxel of this size, m"
     )
 
 

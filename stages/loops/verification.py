@@ -29,51 +29,59 @@ class VerificationSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    reach_m: float = Field(14.0, gt=0, le=100, description="largest translation that is searched, m")
+    reach_m: float = Field(default=14.0, gt=0, le=100, description="largest translation that is searched, m")
     max_distance_m: float = Field(
-        12.0, gt=0, le=100, description="loops between poses farther apart are rejected, m"
+        default=12.0, gt=0, le=100, description="loops between poses farther apart are rejected, m"
     )
-    hypotheses: int = Field(3, ge=1, le=50, description="coarse poses that are refined")
+    hypotheses: int = Field(default=3, ge=1, le=50, description="coarse poses that are refined")
     inlier_distance_m: float = Field(
-        0.3, gt=0, le=5, description="a point with a partner this near is an inlier, m"
+        default=0.3, gt=0, le=5, description="a point with a partner this near is an inlier, m"
     )
     min_inlier_ratio: float = Field(
-        0.55, ge=0, le=1, description="share of submap j with a partner, at least"
+        default=0.55, ge=0, le=1, description="share of submap j with a partner, at least"
     )
-    min_structure_ratio: float = Field(0.35, ge=0, le=1, description="the same of points that are not ground")
+    min_structure_ratio: float = Field(
+        default=0.35, ge=0, le=1, description="the same of points that are not ground"
+    )
     max_rmse_m: float = Field(
-        0.12, gt=0, le=5, description="root mean square residual of the registration, m"
+        default=0.12, gt=0, le=5, description="root mean square residual of the registration, m"
     )
     min_overlap: float = Field(
-        0.4, ge=0, le=1, description="share of voxels of submap j that submap i also fills"
+        default=0.4, ge=0, le=1, description="share of voxels of submap j that submap i also fills"
     )
-    overlap_voxel_m: float = Field(1.0, gt=0.1, le=10, description="voxel of the overlap test, m")
-    max_e1_m: float = Field(0.05, gt=0, le=5, description="worst standard deviation of translation, m")
+    overlap_voxel_m: float = Field(default=1.0, gt=0.1, le=10, description="voxel of the overlap test, m")
+    max_e1_m: float = Field(
+        default=0.05, gt=0, le=5, description="worst standard deviation of translation, m"
+    )
     min_direction_p: float = Field(
-        0.5, ge=0, le=1, description="every direction must be observed beyond noise with this"
+        default=0.5, ge=0, le=1, description="every direction must be observed beyond noise with this"
     )
     min_contrast: float = Field(
-        0.2, ge=0, le=1, description="a copy displaced by 1.5 m must lose this share of inliers"
+        default=0.2, ge=0, le=1, description="a copy displaced by 1.5 m must lose this share of inliers"
     )
     max_disagreement_m: float = Field(
-        0.25, gt=0, le=5, description="forward against backward registration, m"
+        default=0.25, gt=0, le=5, description="forward against backward registration, m"
     )
     max_disagreement_deg: float = Field(
-        1.0, gt=0, le=90, description="forward against backward registration, deg"
+        default=1.0, gt=0, le=90, description="forward against backward registration, deg"
     )
-    drift_m: float = Field(3.0, gt=0, le=100, description="difference from odometry always allowed, m")
+    drift_m: float = Field(
+        default=3.0, gt=0, le=100, description="difference from odometry always allowed, m"
+    )
     drift_share: float = Field(
-        0.04, gt=0, le=1, description="difference from odometry allowed per metre driven"
+        default=0.04, gt=0, le=1, description="difference from odometry allowed per metre driven"
     )
-    vertical_drift_m: float = Field(1.0, gt=0, le=100, description="vertical difference always allowed, m")
+    vertical_drift_m: float = Field(
+        default=1.0, gt=0, le=100, description="vertical difference always allowed, m"
+    )
     vertical_drift_share: float = Field(
-        0.015, gt=0, le=1, description="vertical difference allowed per metre driven"
+        default=0.015, gt=0, le=1, description="vertical difference allowed per metre driven"
     )
     floor_m: float = Field(
-        0.05, gt=0, le=5, description="smallest standard deviation of a loop's translation, m"
+        default=0.05, gt=0, le=5, description="smallest standard deviation of a loop's translation, m"
     )
     floor_deg: float = Field(
-        0.2, gt=0, le=90, description="smallest standard deviation of a loop's rotation, deg"
+        default=0.2, gt=0, le=90, description="smallest standard deviation of a loop's rotation, deg"
     )
 
 

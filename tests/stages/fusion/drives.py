@@ -57,7 +57,7 @@ def rectangle(
     y = np.concatenate(([0], np.cumsum(np.sin(yaw[:-1]) * 0.05)))
     z = 2.0 * np.sin(2 * np.pi * fine / lap)
     yaw_s, xyz = np.interp(s, fine, yaw), np.column_stack([np.interp(s, fine, c) for c in (x, y, z)])
-    T = pose(so3_exp(np.column_stack((0 * s, 0 * s, yaw_s))), xyz + [5.0, -3.0, 1.7])
+    T = pose(so3_exp(np.column_stack((0 * s, 0 * s, yaw_s))), xyz + np.array([5.0, -3.0, 1.7]))
     return World(T, start_ns + (np.arange(len(s)) * 100_000_000).astype(np.int64))
 
 
@@ -111,7 +111,7 @@ def gnss_at(stamp_ns: np.ndarray, position: np.ndarray, sigma: float) -> Gnss:
 def imu_of(world: World, seed: int = 2, sigma: float = 0.05, T_lidar_imu: np.ndarray | None = None) -> Imu:
     """Specific force at scan times by second differences of truth."""
     T = world.T @ (np.eye(4) if T_lidar_imu is None else T_lidar_imu)
-    a = np.gradient(np.gradient(T[:, :3, 3], 0.1, axis=0), 0.1, axis=0) + [0, 0, 9.81]
+    a = np.gradient(np.gradient(T[:, :3, 3], 0.1, axis=0), 0.1, axis=0) + np.array([0, 0, 9.81])
     f = np.einsum("nji,nj->ni", T[:, :3, :3], a)
     rng = np.random.default_rng(seed)
     return Imu(

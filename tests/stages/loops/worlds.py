@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from scanloom.schemas.product import Parts
@@ -56,7 +58,7 @@ def polyline(corners: list[tuple[float, float]], step_m: float = 1.0, z: float =
     """Poses (n, 4, 4) along straight legs, turning on the last metres before each corner."""
     p = np.array(corners, float)
     xy = [p[0]]
-    for a, b in zip(p[:-1], p[1:]):
+    for a, b in pairwise(p):
         n = int(np.linalg.norm(b - a) // step_m)
         xy += [a + (b - a) * k / n for k in range(1, n + 1)]
     at = np.array(xy)
