@@ -65,10 +65,11 @@ class VoxelMap:
         points = points[np.isfinite(points).all(axis=1)]
         self.inserts += 1
         self._reserve(self.voxels + len(points))
-        self.voxels, added = _insert(
+        voxels, added = _insert(
             points, self.voxel_size_m, self.spacing_m**2,
             self.keys, self.values, self.voxel_key, self.count, self.offset, self.fitted, self.voxels,
         )  # fmt: skip
+        self.voxels = int(voxels)
         return int(added)
 
     def points(self) -> F8:
@@ -99,12 +100,18 @@ class VoxelMap:
 
     def _keep(self, kept: I8, capacity: int) -> None:
         """Move the kept voxels into arrays of the given capacity and rebuild the table."""
-        old = (self.voxel_key, self.count, self.offset, self.surface, self.fitted)
-        new = self._blank(capacity)
-        for source, target in zip(old, new, strict=True):
-            target[: len(kept)] = source[kept]
-        self.voxel_key, self.count, self.offset, self.surface, self.fitted = new
-        self.voxels = len(kept)
+        voxel_key, count, offset, surface, fitted = self._blank(capacity)
+        n = len(kept)
+        voxel_key[:n], count[:n], fitted[:n] = self.voxel_key[kept], self.count[kept], self.fitted[kept]
+        offset[:n], surface[:n] = self.offset[kept], self.surface[kept]
+        self.voxel_key, self.count, self.offset, self.surface, self.fitted = (
+            voxel_key,
+            count,
+            offset,
+            surface,
+            fitted,
+        )
+        self.voxels = n
         self.keys = np.full(table_length(capacity), EMPTY, np.int64)
         self.values = np.zeros(len(self.keys), np.int32)
         _index(self.voxel_key, self.voxels, self.keys, self.values)
@@ -151,7 +158,7 @@ def _index(voxel_key: I8, voxels: Int, keys: I8, values: I4) -> None:
 def _insert(
     points: F8, size: Float, spacing2: Float, keys: I8, values: I4, voxel_key: I8, count: I4, offset: F4, fitted: I4,
     voxels: Int,
-) -> tuple[int, int]:  # fmt: skip
+) -> tuple[Int, Int]:  # fmt: skip
     most = offset.shape[1]
     added = 0
     for n in range(len(points)):
@@ -203,14 +210,16 @@ def nearest(
     values: I4,
     count: I4,
     offset: F4,
-) -> tuple[int, int, float]:
+) -> tuple[Int, Int, Float]:
     """Voxel, place in it and squared distance of the stored point nearest to (x, y, z); voxel -1 beyond `limit2`.
 
     Looks into the 27 voxels around, and skips those that cannot hold a nearer point.
     """
     i, j, k = np.int64(np.floor(x / size)), np.int64(np.floor(y / size)), np.int64(np.floor(z / size))
     fx, fy, fz = x - i * size, y - j * size, z - k * size
-    best, best_v, best_c = limit2, -1, -1
+    best = limit2
+    best_v: Int = -1
+    best_c: Int = -1
     for s in range(27):
         di, dj, dk = steps[s, 0], steps[s, 1], steps[s, 2]
         if _gap2(fx, di, size) + _gap2(fy, dj, size) + _gap2(fz, dk, size) >= best:
@@ -229,7 +238,7 @@ def nearest(
 
 
 @kernel
-def _gap2(inside: Float, step: Int, size: Float) -> float:
+def _gap2(inside: Float, step: Int, size: Float) -> Float:
     """Squared distance along one axis to the neighbouring voxel in direction `step`."""
     if step == 0:
         return 0.0
@@ -289,7 +298,7 @@ SURFACE_NOISE2 = 0.05**2
 
 
 @kernel
-def shape_weight(small: Float, middle: Float, large: Float, n: Int) -> float:
+def shape_weight(small: Float, middle: Float, large: Float, n: Int) -> Float:
     """Weight of a residual along the normal, from the eigenvalues (m2) of the n points around.
 
     1 on a clean plane and falling with its roughness; 0 where the points are too few or form a line, since a line of

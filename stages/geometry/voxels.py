@@ -64,10 +64,10 @@ def unpack(key: Int) -> tuple[int, int, int]:
 
 
 @kernel
-def find_slot(keys: NDArray[np.int64], key: Int) -> int:
+def find_slot(keys: NDArray[np.int64], key: Int) -> Int:
     """Slot that holds `key`, or the free slot where it belongs."""
     mask = len(keys) - 1
-    slot = np.int64((np.uint64(key) * _MIX) >> _HIGH) & mask
+    slot: Int = np.int64((np.uint64(key) * _MIX) >> _HIGH) & mask
     while keys[slot] != EMPTY and keys[slot] != key:
         slot = (slot + 1) & mask
     return slot

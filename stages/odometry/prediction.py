@@ -15,7 +15,7 @@ GYRO_STD_RAD_PER_SQRT_S = 0.002
 WHEEL_STD_SHARE = 0.02
 GUESS_RATE_STD_RAD_S = 0.5
 GUESS_ACCELERATION_STD_M_S2 = 3.0
-SIDE_SLIP_STD_SHARE = 0.01
+GUESS_SPEED_STD_M_S = 15.0
 SLIP_M_S = 0.5
 SCALE_PRIOR_M = 20.0
 SCALE_MEMORY_M = 500.0
@@ -46,6 +46,7 @@ class Predictor:
         self._track = MotionTrack.build(imu, wheel, session)
         self._T_base_lidar = np.array(session.T_base("lidar"))
         self._twist: F8 | None = None
+        self._seen_ns: int | None = None
         self._lidar_m = self._wheel_m = SCALE_PRIOR_M
 
     @property
@@ -59,10 +60,8 @@ class Predictor:
         T = self._track.relative(last_ns, now_ns, self._twist)
         if cover.translation:
             T = self._scaled(T)
-        known = self._twist is not None or cover.translation
-        return Prediction(
-            T, self._covariance(T, 1e-9 * (now_ns - last_ns), cover.rotation, cover.translation), known
-        )
+        covariance = self._covariance(T, last_ns, now_ns, cover.rotation, cover.translation)
+        return Prediction(T, covariance, self._twist is not None or cover.translation)
 
     def learn(self, last_ns: int, now_ns: int, T_last_now: F8, *, well_seen: bool) -> None:
         """Take note of the motion that was found; `well_seen`: along every direction by the scan itself."""
@@ -70,6 +69,8 @@ class Predictor:
         if dt <= 0:
             return
         self._twist = se3_log(T_last_now) / dt
+        if well_seen:
+            self._seen_ns = now_ns
         if well_seen and self._track.covers(last_ns, now_ns).translation:
             self._learn_scale(
                 self._forward(self._track.relative(last_ns, now_ns)), self._forward(T_last_now), dt
@@ -94,11 +95,17 @@ class Predictor:
         T: F8 = inverse(self._T_base_lidar) @ T_base @ self._T_base_lidar
         return T
 
-    def _covariance(self, T: F8, dt: float, rotation: bool, translation: bool) -> F8:
-        """Independent errors of rotation and translation, isotropic, growing with time and way."""
+    def _covariance(self, T: F8, last_ns: int, now_ns: int, rotation: bool, translation: bool) -> F8:
+        """Independent errors of rotation and translation, isotropic, growing with time and way.
+
+        A guess is the worse the longer ago all of the motion was seen: its speed may have changed since.
+        """
+        dt = 1e-9 * (now_ns - last_ns)
         way = float(np.linalg.norm(T[:3, 3]))
+        unseen_s = 1e-9 * (now_ns - self._seen_ns) if self._seen_ns is not None else np.inf
         turn_std = GYRO_STD_RAD_PER_SQRT_S * np.sqrt(dt) if rotation else GUESS_RATE_STD_RAD_S * dt
-        way_std = WHEEL_STD_SHARE * way if translation else GUESS_ACCELERATION_STD_M_S2 * dt * max(dt, 0.1)
+        speed_std = min(GUESS_ACCELERATION_STD_M_S2 * unseen_s, GUESS_SPEED_STD_M_S)
+        way_std = WHEEL_STD_SHARE * way if translation else speed_std * dt
         return np.diag([turn_std**2 + 1e-8] * 3 + [way_std**2 + 1e-6] * 3)
 
 

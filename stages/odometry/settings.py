@@ -41,7 +41,7 @@ class Settings(BaseModel):
     least_scale_m: float = Field(0.1, ge=0.01, le=5.0, description="smallest scale of the robust kernel, m")
     most_scale_m: float = Field(0.5, ge=0.01, le=10.0, description="largest scale of the robust kernel, m")
     least_inlier_ratio: float = Field(
-        0.15, ge=0.0, le=1.0, description="registrations with a smaller share of inliers are not used"
+        0.05, ge=0.0, le=1.0, description="registrations with a smaller share of inliers are not used"
     )
     least_bound_m: float = Field(
         1.0, ge=0.01, le=100.0, description="corrections up to this are always plausible, m"

@@ -15,6 +15,8 @@ from scanloom.stages.odometry.prediction import Prediction, Predictor, forward_g
 from scanloom.stages.odometry.settings import Settings
 
 MIN_POINTS = 50
+MIN_INLIERS = 30
+MIN_INLIERS_OF_MATCHES = 0.4
 MAX_BRIDGED = 10
 
 
@@ -90,7 +92,7 @@ class Tracker:
         registration = self._align_from(prediction, coarse)
         seen = judge(registration, point_noise_m=self.settings.point_noise_m)
         weak = seen.p < self.settings.least_p
-        if weak.any() and prediction.known:
+        if weak.any():
             registration = self._align(
                 coarse, self.T @ prediction.T_last_now, free=seen.observed(self.settings.least_p)
             )
@@ -99,7 +101,7 @@ class Tracker:
             seen, registration.sigma2, inflation=self.settings.covariance_inflation, floor_m=self.settings.floor_m,
             floor_rad=self.settings.floor_rad, predicted=prediction.covariance, least_p=self.settings.least_p,
         )  # fmt: skip
-        reliable = self._credible(registration, T_last_now, prediction)
+        reliable = self._credible(registration, len(coarse), T_last_now, prediction)
         if not reliable:
             covariance = prediction.covariance
         return Found(
@@ -125,9 +127,14 @@ class Tracker:
             max_iterations=self.settings.max_iterations, free=free,
         )  # fmt: skip
 
-    def _credible(self, registration: Registration, T_last_now: F8, prediction: Prediction) -> bool:
+    def _credible(
+        self, registration: Registration, points: int, T_last_now: F8, prediction: Prediction
+    ) -> bool:
         """Converged, on enough of the scan, and not further from the prediction than motion can explain."""
+        inliers = registration.inlier_ratio * points
         if not registration.converged or registration.inlier_ratio < self.settings.least_inlier_ratio:
+            return False
+        if inliers < max(MIN_INLIERS, MIN_INLIERS_OF_MATCHES * len(registration.points)):
             return False
         if not prediction.known:
             return True
