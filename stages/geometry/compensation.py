@@ -28,10 +28,10 @@ def compensate(
     """
     if len(stamp_ns) == 0:
         return x_m, y_m, z_m
-    first, last = (
-        int(np.clip(t, reference_ns - LONGEST_SWEEP_NS, reference_ns + LONGEST_SWEEP_NS))
-        for t in _span(stamp_ns)
+    span = np.clip(
+        (stamp_ns.min(), stamp_ns.max()), reference_ns - LONGEST_SWEEP_NS, reference_ns + LONGEST_SWEEP_NS
     )
+    first, last = int(span[0]), int(span[1])
     if first == last:
         return x_m, y_m, z_m
     step_ns = (last - first) / KNOTS
@@ -40,11 +40,6 @@ def compensate(
     if not moved.any():
         return x_m, y_m, z_m
     return _displace(stamp_ns, x_m, y_m, z_m, first, 1.0 / step_ns, moved)
-
-
-@kernel
-def _span(stamp_ns: I8) -> tuple[int, int]:
-    return stamp_ns.min(), stamp_ns.max()
 
 
 @kernel

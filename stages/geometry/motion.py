@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.stages.geometry.kernels import kernel
-from scanloom.stages.geometry.se3 import F8, inverse
+from scanloom.stages.geometry.se3 import F8, inverse, so3_exp
 
 I8 = NDArray[np.int64]
 
@@ -129,8 +129,7 @@ class MotionTrack:
         cover = self.covers(first, last)
         node_ns = self._nodes(at_ns, reference_ns, first, last)
         rate, velocity = self._rates(node_ns, cover, twist)
-        time_s = np.asarray(1e-9 * (node_ns - first), np.float64)
-        T_first_base = integrate(time_s, rate, velocity)
+        T_first_base = integrate(1e-9 * (node_ns - first).astype(np.float64), rate, velocity)
         T_reference_base = inverse(T_first_base[np.searchsorted(node_ns, reference_ns)]) @ T_first_base
         moved = T_reference_base[np.searchsorted(node_ns, at_ns)] - np.eye(4)
         T_reference_lidar: F8 = np.eye(4) + inverse(self.T_base_lidar) @ moved @ self.T_base_lidar
@@ -162,56 +161,37 @@ class MotionTrack:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-@kernel
 def integrate(time_s: F8, rate: F8, velocity: F8) -> F8:
     """Poses T_0_k (n, 4, 4) at increasing times (n,) from body rates (n, 3), rad/s, and body velocities (n, 3), m/s.
 
     R_{k+1} = R_k Exp(w dt), p_{k+1} = p_k + R_k Exp(w dt / 2) v dt with the mean w, v of the two ends (methods 1.4).
     """
-    n = len(time_s)
-    T = np.zeros((n, 4, 4))
-    for i in range(4):
-        T[:, i, i] = 1.0
-    half = np.eye(3)
-    for k in range(n - 1):
-        dt = time_s[k + 1] - time_s[k]
-        w = 0.5 * (rate[k] + rate[k + 1])
-        v = 0.5 * (velocity[k] + velocity[k + 1])
-        _exp(0.5 * dt * w, half)
-        R = T[k, :3, :3]
-        middle = _product(R, half)
-        T[k + 1, :3, :3] = _product(middle, half)
-        for i in range(3):
-            T[k + 1, i, 3] = T[k, i, 3] + dt * (
-                middle[i, 0] * v[0] + middle[i, 1] * v[1] + middle[i, 2] * v[2]
-            )
+    dt = np.diff(time_s)[:, None]
+    half = so3_exp(0.5 * dt * 0.5 * (rate[:-1] + rate[1:]))
+    moved = dt * 0.5 * (velocity[:-1] + velocity[1:])
+    T = np.zeros((len(time_s), 4, 4))
+    T[:] = np.eye(4)
+    _chain(half, moved, T)
     return T
 
 
 @kernel
-def _product(A: F8, B: F8) -> F8:
-    C = np.zeros((3, 3))
-    for i in range(3):
-        for j in range(3):
-            C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
-    return C
-
-
-@kernel
-def _exp(w: F8, R: F8) -> None:
-    """Rodrigues' formula, written into R."""
-    x, y, z = w[0], w[1], w[2]
-    angle = np.sqrt(x * x + y * y + z * z)
-    if angle < 1e-6:
-        a, b = 1.0 - angle * angle / 6.0, 0.5
-    else:
-        a, b = np.sin(angle) / angle, 2.0 * (np.sin(0.5 * angle) / angle) ** 2
-    R[0, 0] = 1.0 - b * (y * y + z * z)
-    R[1, 1] = 1.0 - b * (x * x + z * z)
-    R[2, 2] = 1.0 - b * (x * x + y * y)
-    R[0, 1], R[1, 0] = b * x * y - a * z, b * x * y + a * z
-    R[0, 2], R[2, 0] = b * x * z + a * y, b * x * z - a * y
-    R[1, 2], R[2, 1] = b * y * z - a * x, b * y * z + a * x
+def _chain(half: F8, moved: F8, T: F8) -> None:
+    """Compose half-step rotations (n - 1, 3, 3) and body displacements (n - 1, 3) into poses T (n, 4, 4)."""
+    for k in range(len(half)):
+        for i in range(3):
+            shift = 0.0
+            for j in range(3):
+                middle = 0.0
+                for m in range(3):
+                    middle += T[k, i, m] * half[k, m, j]
+                T[k + 1, i, j] = middle
+                shift += middle * moved[k, j]
+            T[k + 1, i, 3] = T[k, i, 3] + shift
+        for i in range(3):
+            a, b, c = T[k + 1, i, 0], T[k + 1, i, 1], T[k + 1, i, 2]
+            for j in range(3):
+                T[k + 1, i, j] = a * half[k, 0, j] + b * half[k, 1, j] + c * half[k, 2, j]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
