@@ -7,7 +7,7 @@ import logging
 import os
 import queue
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
@@ -39,8 +39,13 @@ class Executor(Protocol):
     def slots(self) -> int:
         """Tasks that may be under way at once."""
 
-    def submit(self, key: str, spec: Json) -> None:
-        """Start a task."""
+    def submit(self, key: str, spec: Json, resources: Mapping[str, float]) -> None:
+        """Start a task on a worker that offers these resources.
+
+        Raises
+        ------
+        UsageError : no worker offers them.
+        """
 
     def next(self, timeout_s: float) -> Outcome | None:
         """Wait for a task to end; None when none did in time."""
@@ -49,8 +54,10 @@ class Executor(Protocol):
         """Stop everything that is under way."""
 
 
-def executor(cluster: str, workers: int | None) -> Executor:
+def executor(cluster: str, workers: int | None, modules: Sequence[str] = ()) -> Executor:
     """The executor of `--cluster`: `none`, `local`, an address such as `tcp://host:8786`, or `module:factory`.
+
+    Local workers start with `modules` imported.
 
     Raises
     ------
@@ -61,7 +68,7 @@ def executor(cluster: str, workers: int | None) -> Executor:
     if cluster == "none":
         return InProcess()
     if cluster == "local":
-        return DaskExecutor(lambda: _local(workers))
+        return DaskExecutor(lambda: _local(workers, modules))
     if "://" in cluster:
         return DaskExecutor(lambda: _remote(cluster))
     if ":" in cluster:
@@ -80,7 +87,9 @@ class InProcess:
     def slots(self) -> int:
         return 1
 
-    def submit(self, key: str, spec: Json) -> None:
+    def submit(self, key: str, spec: Json, resources: Mapping[str, float]) -> None:
+        if resources:
+            raise _unmet(spec, resources)
         self._waiting.append((key, spec))
 
     def next(self, timeout_s: float) -> Outcome | None:
@@ -101,6 +110,7 @@ class DaskExecutor:
         self._futures: dict[str, Any] = {}
         self._counted_at = 0.0
         self._threads = 0
+        self._empty_since = time.monotonic()
         self._await_workers()
 
     def _await_workers(self) -> None:
@@ -119,24 +129,51 @@ class DaskExecutor:
             self._counted_at = time.monotonic()
         return max(self._threads, 1)
 
-    def submit(self, key: str, spec: Json) -> None:
-        future = self._client.submit(
-            execute, spec, key=f"{spec['identity']['stage']}-{key}", pure=False, retries=0
-        )
+    def submit(self, key: str, spec: Json, resources: Mapping[str, float]) -> None:
+        if resources and not self._offered(resources):
+            raise _unmet(spec, resources)
+        name = f"{spec['identity']['stage']}-{key}"
+        future = self._client.submit(execute, spec, key=name, pure=False, resources=dict(resources) or None)
         self._futures[key] = future
         future.add_done_callback(lambda done, key=key: self._done.put((key, done)))
+
+    def _offered(self, resources: Mapping[str, float]) -> bool:
+        workers = self._client.scheduler_info(n_workers=-1)["workers"].values()
+        return any(
+            all(worker["resources"].get(name, 0) >= amount for name, amount in resources.items())
+            for worker in workers
+        )
 
     def next(self, timeout_s: float) -> Outcome | None:
         try:
             key, future = self._done.get(timeout=timeout_s)
         except queue.Empty:
+            self._check_alive()
             return None
         self._futures.pop(key, None)
         if future.status == "finished":
             answer: Json = future.result()
             return key, answer
-        error = future.exception() if future.status == "error" else RuntimeError(f"task was {future.status}")
+        self._check_alive()
+        error = (
+            future.exception() if future.status == "error" else RuntimeError(f"its task was {future.status}")
+        )
         return key, error
+
+    def _check_alive(self) -> None:
+        """Fail rather than wait for ever on a cluster that is gone."""
+        if self._client.status != "running":
+            raise ScanloomError(
+                "the connection to the cluster is lost",
+                next_step="start it again and run the same command; what is done is kept",
+            )
+        if self._client.nthreads():
+            self._empty_since = time.monotonic()
+        elif time.monotonic() - self._empty_since > WORKERS_WITHIN_S:
+            raise ScanloomError(
+                f"the cluster has had no worker for {WORKERS_WITHIN_S:.0f} s",
+                next_step="start workers and run the same command; what is done is kept",
+            )
 
     def close(self) -> None:
         with _quiet():
@@ -154,12 +191,12 @@ def worker_death(error: BaseException) -> str:
     return "the worker died twice over it (out of memory, or a crash in native code)"
 
 
-def _local(workers: int | None) -> tuple[Any, Any]:
+def _local(workers: int | None, modules: Sequence[str]) -> tuple[Any, Any]:
     """Processes of this machine, one per core."""
+    _start_forkserver(modules)
     import dask
     from distributed import Client, LocalCluster
 
-    os.environ.update({name: os.environ.get(name, value) for name, value in THREADS.items()})
     dask.config.set(
         {
             "distributed.scheduler.allowed-failures": 1,
@@ -172,7 +209,6 @@ def _local(workers: int | None) -> tuple[Any, Any]:
             "distributed.comm.timeouts.connect": "60s",
         }
     )
-    _preload_forkserver()
     cluster = LocalCluster(
         n_workers=workers or os.cpu_count() or 1,
         threads_per_worker=1,
@@ -185,13 +221,16 @@ def _local(workers: int | None) -> tuple[Any, Any]:
     return Client(cluster, set_as_default=False), cluster
 
 
-def _preload_forkserver() -> None:
-    """Workers fork from a process that has the imports done already."""
-    import multiprocessing
+def _start_forkserver(modules: Sequence[str]) -> None:
+    """Start the process that workers fork from. It imports what they need while this process imports Dask."""
+    from multiprocessing import forkserver, get_context
 
-    multiprocessing.get_context("forkserver").set_forkserver_preload(
+    for name, value in THREADS.items():
+        os.environ.setdefault(name, value)
+    get_context("forkserver").set_forkserver_preload(
         ["distributed", "scanloom.pipeline.task", "pyarrow.parquet"]
     )
+    forkserver.ensure_running()
 
 
 def _remote(address: str) -> tuple[Any, Any]:
@@ -236,13 +275,18 @@ def _quiet() -> Iterator[None]:
     yield
 
 
-def unanswered(place: str, error: BaseException) -> ScanloomError:
+def unanswered(error: BaseException) -> ScanloomError:
     """The error of a task that gave no answer."""
     death = worker_death(error)
     if death:
-        return ScanloomError(
-            death, where=place, next_step="use fewer --workers, or --cluster none to see it happen"
-        )
-    return ScanloomError(
-        f"the cluster gave no answer: {error}", where=place, next_step="run the same command again"
+        return ScanloomError(death, next_step="use fewer --workers, or --cluster none to see it happen")
+    return ScanloomError(f"the cluster gave no answer: {error}", next_step="run the same command again")
+
+
+def _unmet(spec: Json, resources: Mapping[str, float]) -> UsageError:
+    asked = ", ".join(f"{name} {amount:g}" for name, amount in resources.items())
+    return UsageError(
+        f"no worker offers {asked}",
+        where=spec["place"],
+        next_step="start a worker with `dask worker --resources`, and name its scheduler with --cluster",
     )

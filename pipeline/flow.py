@@ -6,45 +6,27 @@ nor reads files; `run` and `plan` drive it.
 
 from __future__ import annotations
 
-import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from pydantic import BaseModel
 
-from scanloom.pipeline.node import AXES, Node
+from scanloom.pipeline.node import Node
+from scanloom.pipeline.request import (
+    FIXED,
+    Request,
+    SessionInput,
+    check_sessions,
+    ordered,
+    part_axes,
+    session_settings,
+    writers_of,
+)
 from scanloom.pipeline.settings import resolve
-from scanloom.pipeline.store import RESERVED, Artifact, StoredPart, part_coordinate
-from scanloom.schemas.errors import ScanloomError, UsageError
-from scanloom.schemas.product import Coordinate, Files, Product
-
-FIXED = ("map", "session")
-"""Fan-outs that are known before anything ran."""
-
-
-@dataclass(frozen=True)
-class SessionInput:
-    """One log of a request."""
-
-    name: str
-    """Unique in the request; letters, digits, `.`, `_`, `-`."""
-    sources: Mapping[type[Product], Files]
-    """Existing files outside the store, by the product they are."""
-    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """{stage: {field: value}} for tasks of this session."""
-    tags: frozenset[str] = frozenset()
-    """Nodes with `only` run for sessions with that tag."""
-
-
-@dataclass(frozen=True)
-class Request:
-    """What to compute: a workflow, its sessions, and settings over the defaults."""
-
-    nodes: tuple[Node, ...]
-    sessions: tuple[SessionInput, ...]
-    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+from scanloom.pipeline.store import Artifact, StoredPart, part_coordinate
+from scanloom.schemas.errors import ScanloomError
+from scanloom.schemas.product import Coordinate, Product
 
 
 @dataclass(frozen=True)
@@ -120,18 +102,18 @@ class Flow:
 
     def __init__(self, request: Request) -> None:
         self.sessions = {session.name: session for session in request.sessions}
-        self.writers = _writers(request.nodes)
-        self.nodes = _ordered(request.nodes, self.writers)
+        self.writers = writers_of(request.nodes)
+        self.nodes = ordered(request.nodes, self.writers)
         self.depth = {node.name: i for i, node in enumerate(self.nodes)}
-        _check_sessions(request, self.nodes, self.writers)
+        check_sessions(request, self.nodes, self.writers)
         self._readers = {n.name: [r for r in self.nodes if self._reads_from(r, n)] for n in self.nodes}
         self._common = resolve(self.nodes, [("settings", request.settings)])
-        self._own = {s.name: _session_settings(request, s) for s in request.sessions}
+        self._own = {s.name: session_settings(request, s) for s in request.sessions}
         self._groups: dict[tuple[str, str | None], Group] = {}
         for node in self.nodes:
             for scope in self._scopes(node):
                 self._groups[node.name, scope] = Group()
-        self._tiles: dict[
+        self._indexes: dict[
             tuple[type[Product], tuple[str, ...]], dict[Coordinate, list[tuple[Coordinate, Ref]]]
         ] = {}
         self._fresh: list[Task] = []
@@ -376,7 +358,7 @@ class Flow:
         self, task: Task, product: type[Product], shared: tuple[str, ...]
     ) -> dict[Coordinate, list[tuple[Coordinate, Ref]]]:
         """Parts by the axes they share with tasks such as `task`; made once, when all of them are there."""
-        index = self._tiles.get((product, shared))
+        index = self._indexes.get((product, shared))
         if index is None:
             index = defaultdict(list)
             for part in self._all(task, product):
@@ -385,7 +367,7 @@ class Flow:
                 g.settled for w, s in self.providers(task, product) if w for g in self._groups_of(w, s)
             )
             if whole:
-                self._tiles[product, shared] = index
+                self._indexes[product, shared] = index
         return index
 
     def _all(self, task: Task, product: type[Product]) -> list[tuple[Coordinate, Ref]]:
@@ -395,12 +377,6 @@ class Flow:
                 found.append(((("session", session),), Source(self.sessions[session], product)))
         found.extend(_parts(product, self.above(task, product)))
         return found
-
-
-def part_axes(product: type[Product], writer: Node) -> tuple[str, ...]:
-    """Axes of the parts of a product: the writer's, plus the one it is split along."""
-    split = product.SPLIT_BY
-    return writer.axes if split is None or split in writer.axes else (*writer.axes, split)
 
 
 def _parts(product: type[Product], tasks: Iterable[Task]) -> Iterator[tuple[Coordinate, Ref]]:
@@ -422,92 +398,3 @@ def _losses(tasks: Iterable[Task]) -> frozenset[str]:
 def _project(coordinate: Coordinate, axes: Sequence[str]) -> Coordinate:
     values = dict(coordinate)
     return tuple((axis, values[axis]) for axis in axes if axis in values)
-
-
-# --- checks of a request --------------------------------------------------------------------------------------------
-
-
-def _writers(nodes: Sequence[Node]) -> dict[type[Product], Node]:
-    writers: dict[type[Product], Node] = {}
-    names: set[str] = set()
-    for node in nodes:
-        if node.name in names or node.name in RESERVED:
-            raise UsageError(f"node name {node.name} is taken", next_step="give it another name")
-        names.add(node.name)
-        if node.only is not None and "session" not in node.axes:
-            raise UsageError(f"node {node.name} has `only` but runs per {node.per}, not per session")
-        for product in node.writes:
-            if product in writers:
-                raise UsageError(f"{product.NAME} is written by {writers[product].name} and by {node.name}")
-            writers[product] = node
-    return writers
-
-
-def _ordered(nodes: Sequence[Node], writers: Mapping[type[Product], Node]) -> tuple[Node, ...]:
-    """Writers before readers; otherwise as declared."""
-    done: dict[str, Node] = {}
-    active: set[str] = set()
-
-    def visit(node: Node) -> None:
-        if node.name in done:
-            return
-        if node.name in active:
-            raise UsageError(f"node {node.name} reads what depends on what it writes")
-        active.add(node.name)
-        for product in node.reads:
-            if product in writers:
-                visit(writers[product])
-        done[node.name] = node
-
-    for node in nodes:
-        visit(node)
-    return tuple(done.values())
-
-
-def _check_sessions(request: Request, nodes: Sequence[Node], writers: Mapping[type[Product], Node]) -> None:
-    names = [session.name for session in request.sessions]
-    for name in names:
-        if names.count(name) > 1:
-            raise UsageError(f"session name {name} is used twice", next_step="name the sessions apart")
-        if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name):
-            raise UsageError(f"session name {name!r} must be letters, digits, `.`, `_` or `-`")
-    for node in nodes:
-        if node.per not in FIXED and not any(
-            product in writers and set(AXES[node.per]) <= set(part_axes(product, writers[product]))
-            for product in node.reads
-        ):
-            raise UsageError(f"node {node.name} runs per {node.per} but reads nothing that is split so")
-        for product in node.reads:
-            _check_provided(node, product, request.sessions, writers)
-
-
-def _check_provided(
-    node: Node,
-    product: type[Product],
-    sessions: Sequence[SessionInput],
-    writers: Mapping[type[Product], Node],
-) -> None:
-    writer = writers.get(product)
-    if writer is not None and writer.only is None:
-        return
-    for session in sessions:
-        applies = node.only is None or node.only in session.tags
-        made = writer is not None and writer.only in session.tags
-        if applies and not made and product not in session.sources:
-            raise UsageError(
-                f"session {session.name} brings no {product.NAME}, which {node.name} reads",
-                next_step=f"give its {product.NAME}",
-            )
-
-
-def _session_settings(request: Request, session: SessionInput) -> dict[str, BaseModel]:
-    per_session = {node.name for node in request.nodes if "session" in node.axes}
-    for stage in session.settings:
-        if stage not in per_session and any(node.name == stage for node in request.nodes):
-            raise UsageError(
-                f"stage {stage} runs for the whole map, so one session cannot set it",
-                where=f"session {session.name}",
-                next_step="set it for all sessions",
-            )
-    layers = [("settings", request.settings), (f"session {session.name}", session.settings)]
-    return resolve(request.nodes, layers)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from scanloom.pipeline.fingerprint import SCHEMA, code_version, digest, files_digest
-from scanloom.pipeline.flow import Input, Source, Task
+from scanloom.pipeline.flow import Flow, Input, Source, Task
 from scanloom.pipeline.node import Node
 from scanloom.pipeline.store import Store
 from scanloom.pipeline.task import Json, import_path
@@ -28,8 +28,11 @@ class Order:
 class Identifier:
     """Makes orders; remembers code versions and the digests of source files for one run."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, flow: Flow, store: Store) -> None:
+        self._flow = flow
         self._store = store
+        self._bytes: dict[str | None, int] = {}
+        self._circumstances = {"git_commit": git_commit()}
         self._code: dict[str, Json] = {}
         self._sources: dict[tuple[Path, tuple[str, ...]], str] = {}
 
@@ -57,6 +60,7 @@ class Identifier:
             "settings_model": import_path(node.settings),
             "coordinate": [list(pair) for pair in task.coordinate],
             "place": str(task),
+            "circumstances": self._circumstances,
             "reads": reads,
             "writes": [import_path(product) for product in node.writes],
         }
@@ -70,6 +74,16 @@ class Identifier:
             "code": self._code_of(task.node),
             "settings": task.settings.model_dump(mode="json"),
         }
+
+    def session_bytes(self, task: Task) -> int:
+        """Size of the files that the task's session brings along; 0 for tasks of the whole map."""
+        session = task.session
+        if session not in self._bytes:
+            sources = self._flow.sessions[session].sources.values() if session is not None else ()
+            self._bytes[session] = sum(
+                _size(_root(files) / name) for files in sources for name in files.names
+            )
+        return self._bytes[session]
 
     def _code_of(self, node: Node) -> Json:
         if node.name not in self._code:
@@ -101,3 +115,20 @@ def _root(files: Files) -> Path:
             raise InvalidInput("source files have no folder", next_step="give Files(root=..., names=...)")
         return Path(".").absolute()
     return Path(files.root).absolute()
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
+
+
+def git_commit() -> str:
+    """Commit of the checkout this code runs from; empty for an installed package."""
+    git = Path(__file__).resolve().parents[1] / ".git"
+    try:
+        head = (git / "HEAD").read_text().strip()
+        return (git / head[5:]).read_text().strip() if head.startswith("ref: ") else head
+    except OSError:
+        return ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,6 +39,8 @@ class Node:
     title: str
     only: str | None = None
     """Runs for sessions with this tag only (for instance `simulated`)."""
+    resources: tuple[tuple[str, float], ...] = ()
+    """What a worker must offer, for instance (("GPU", 1),)."""
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -54,6 +56,7 @@ def node(
     writes: type[Product] | tuple[type[Product], ...],
     title: str = "",
     only: str | None = None,
+    resources: Mapping[str, float] | None = None,
 ) -> Node:
     """Declare a line of a workflow.
 
@@ -72,4 +75,5 @@ def node(
     except AttributeError as error:
         raise UsageError(f"node {name}: module {stage.__module__} lacks Settings or VERSION") from error
     outputs = writes if isinstance(writes, tuple) else (writes,)
-    return Node(name, stage, per, reads, outputs, settings, version, title or name, only)
+    needs = tuple(sorted((resources or {}).items()))
+    return Node(name, stage, per, reads, outputs, settings, version, title or name, only, needs)

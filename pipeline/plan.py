@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from scanloom.pipeline.flow import Flow, Request, SessionInput, Task
+from scanloom.pipeline.flow import Flow, Task
 from scanloom.pipeline.history import History
 from scanloom.pipeline.identity import Identifier
+from scanloom.pipeline.request import Request, SessionInput
 from scanloom.pipeline.store import Store
 from scanloom.schemas.errors import ScanloomError
 
@@ -36,7 +37,7 @@ def plan(request: Request, store: Store) -> list[PlannedTask]:
     UsageError : the workflow, the sessions or the settings are wrong.
     """
     flow = Flow(request)
-    identifier, history = Identifier(store), History(store)
+    identifier, history = Identifier(flow, store), History(store)
     planned: list[PlannedTask] = []
     while fresh := flow.take():
         for task in fresh:

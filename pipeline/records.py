@@ -8,12 +8,14 @@ import re
 import socket
 import time
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
 import psutil
 
 from scanloom.pipeline.store import FAILURES, RUNS, Store, store_error
+from scanloom.schemas.errors import ScanloomError
 
 RUNNING = "running"
 
@@ -91,14 +93,21 @@ def run_records(store: Store) -> list[RunRecord]:
     return records
 
 
-def record_failure(store: Store, place: str, key: str, body: Mapping[str, Any]) -> Path | None:
-    """Keep the traceback of a failed task in `failures/`, one file per task and cause."""
-    name = re.sub(r"[^A-Za-z0-9._-]+", "-", place) + (f"-{key[:12]}" if key else "")
-    path = store.root / FAILURES / f"{name}.json"
+def record_failure(store: Store, place: str, error: ScanloomError, trace: str) -> Path | None:
+    """Keep the error and the traceback of a failed task in `failures/`, until the task succeeds."""
+    path = _failure_path(store, place)
     try:
-        path.write_text(
-            json.dumps({"task": place, "key": key, "at_unix_s": time.time(), **body}, indent=1) + "\n"
-        )
+        path.write_text(f"{error}\n\n{trace}")
     except OSError:
         return None
     return path
+
+
+def forget_failure(store: Store, place: str) -> None:
+    """The task succeeded."""
+    with suppress(OSError):
+        _failure_path(store, place).unlink(missing_ok=True)
+
+
+def _failure_path(store: Store, place: str) -> Path:
+    return store.root / FAILURES / (re.sub(r"[^A-Za-z0-9._-]+", "-", place) + ".txt")

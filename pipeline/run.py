@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import itertools
 import logging
 from collections import defaultdict
 from dataclasses import dataclass
@@ -11,15 +12,17 @@ from pathlib import Path
 from typing import TypeVar
 
 from scanloom.pipeline.cluster import Executor, executor, unanswered
-from scanloom.pipeline.flow import Flow, Request, Task
+from scanloom.pipeline.flow import Flow, Task
 from scanloom.pipeline.history import History
 from scanloom.pipeline.identity import Identifier, Order
 from scanloom.pipeline.memory import PeakMemory, now_s
 from scanloom.pipeline.plan import plan
 from scanloom.pipeline.progress import Progress, Silent
-from scanloom.pipeline.records import RunRecord, record_failure
+from scanloom.pipeline.records import RunRecord, forget_failure, record_failure
+from scanloom.pipeline.request import Request
 from scanloom.pipeline.store import Artifact, Store, part_coordinate
 from scanloom.pipeline.task import Json, describe_error, rebuild_error
+from scanloom.pipeline.upkeep import clean
 from scanloom.schemas.errors import ScanloomError, StoreError
 from scanloom.schemas.product import Coordinate, Parts, Product
 
@@ -122,15 +125,15 @@ class Driver:
         self._cluster = cluster
         self._workers = workers
         self._progress = progress
-        self._identifier = Identifier(store)
+        self._identifier = Identifier(self._flow, store)
         self._history = History(store)
         self._executor: Executor | None = None
-        self._ready: list[tuple[int, Coordinate, int, Task, Order]] = []
+        self._ready: list[tuple[tuple[int, int, Coordinate], int, Task, Order]] = []
         self._running: dict[str, tuple[Task, Order]] = {}
-        self._twins: dict[str, list[Task]] = defaultdict(list)
+        self._twins: dict[str, list[Task]] = {}
         self._records: dict[Task, TaskRecord] = {}
         self._reasons: dict[str, str] = {}
-        self._serial = 0
+        self._serial = itertools.count()
         self._peaks: dict[tuple[str, int], float] = {}
         self.artifacts: list[tuple[Coordinate, Artifact]] = []
 
@@ -145,8 +148,9 @@ class Driver:
 
     def drive(self) -> None:
         """Until nothing is ready and nothing runs."""
+        clean(self._store)
         record = RunRecord.start(self._store)
-        state = "interrupted"
+        state = "failed"
         self._progress.begin([(node.name, node.title) for node in self._flow.nodes])
         try:
             self._look_up()
@@ -155,6 +159,9 @@ class Driver:
                 self._collect()
                 self._look_up()
             state = "finished"
+        except KeyboardInterrupt:
+            state = "interrupted"
+            raise
         finally:
             if self._executor is not None:
                 self._executor.close()
@@ -182,21 +189,22 @@ class Driver:
 
     def _queue(self, task: Task, order: Order) -> None:
         task.key = order.key
-        if order.key in self._reasons:
+        if order.key in self._twins:
             self._twins[order.key].append(task)
             return
+        self._twins[order.key] = []
         self._reasons[order.key] = self._history.reason(task, order.identity)
-        self._serial += 1
-        rank = -self._flow.depth[task.node.name]
-        heapq.heappush(self._ready, (rank, task.coordinate, self._serial, task, order))
+        rank = (-self._flow.depth[task.node.name], -self._identifier.session_bytes(task), task.coordinate)
+        heapq.heappush(self._ready, (rank, next(self._serial), task, order))
 
     def _submit(self) -> None:
         if self._executor is None:
-            self._executor = executor(self._cluster, self._workers)
+            modules = sorted({node.stage.__module__ for node in self._flow.nodes})
+            self._executor = executor(self._cluster, self._workers, modules)
         while self._ready and len(self._running) < self._executor.slots():
             *_, task, order = heapq.heappop(self._ready)
             self._running[order.key] = (task, order)
-            self._executor.submit(order.key, order.spec)
+            self._executor.submit(order.key, order.spec, dict(task.node.resources))
         self._show()
 
     def _collect(self) -> None:
@@ -206,8 +214,7 @@ class Driver:
         key, answer = outcome
         task, _ = self._running.pop(key)
         if isinstance(answer, BaseException):
-            error = unanswered(str(task), answer)
-            self._fail(task, key, describe_error(error, ""))
+            self._fail(task, key, describe_error(unanswered(answer), str(task)))
         elif answer["error"] is not None:
             self._fail(task, key, answer["error"], answer)
         else:
@@ -234,12 +241,15 @@ class Driver:
         task.key = artifact.key
         self.artifacts.append((task.coordinate, artifact))
         self._record(task, verdict, reason, answer)
+        forget_failure(self._store, str(task))
         self._flow.finish(task, artifact)
 
     def _fail(self, task: Task, key: str, body: Json, answer: Json | None = None) -> None:
         """One bad session does not stop the others; a store that cannot be written stops everything."""
         error = rebuild_error(body)
-        record_failure(self._store, str(task), key, body)
+        kept = record_failure(self._store, str(task), error, body["trace"])
+        if type(error) is ScanloomError and not error.next_step and kept is not None:
+            error.next_step = f"this is a fault of the stage; the traceback is in {kept}"
         if isinstance(error, StoreError):
             raise error
         self._progress.note(f"{task.node.title} failed: {error}")

@@ -14,11 +14,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from scanloom.pipeline.fingerprint import FileHashes, file_digest, files_digest
 from scanloom.schemas.errors import ProductError, StoreError
 from scanloom.schemas.product import Coordinate, Files, Product
+
+if TYPE_CHECKING:
+    from scanloom.pipeline.inspection import Explanation, Status
+    from scanloom.pipeline.upkeep import Garbage, Problem
 
 MANIFEST = "manifest.json"
 RUN = "run.json"
@@ -128,11 +132,15 @@ class Store:
         return self.root / stage / key
 
     def find(self, stage: str, key: str) -> Artifact | None:
-        """The artifact with this key; None when it was not made, or its manifest is unreadable."""
+        """The artifact with this key; None when it was not made, or files of it are missing or cut."""
         try:
-            return Artifact.read(self.folder(stage, key))
+            artifact = Artifact.read(self.folder(stage, key))
+            whole = all(
+                (artifact.folder / f.path).stat().st_size == f.size for p in artifact.parts for f in p.files
+            )
         except (OSError, ValueError):
             return None
+        return artifact if whole else None
 
     def stages(self) -> list[str]:
         return sorted(p.name for p in self.root.iterdir() if p.is_dir() and p.name not in RESERVED)
@@ -157,6 +165,31 @@ class Store:
             yield Draft(self, folder, stage, key)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
+
+    def verify(self) -> list[Problem]:
+        """Hash every file again; damaged artifacts go to quarantine. See `upkeep.verify`."""
+        from scanloom.pipeline import upkeep
+
+        return upkeep.verify(self)
+
+    def gc(self, **options: Any) -> Garbage:
+        """Drop what recent runs did not use. See `upkeep.gc` for the options."""
+        from scanloom.pipeline import upkeep
+
+        return upkeep.gc(self, **options)
+
+    def status(self) -> Status:
+        """Size per stage, last runs, standing failures."""
+        from scanloom.pipeline import inspection
+
+        return inspection.status(self)
+
+
+def explain(store: Store, key_or_prefix: str) -> Explanation:
+    """Why an artifact is what it is. See `inspection.explain`."""
+    from scanloom.pipeline import inspection
+
+    return inspection.explain(store, key_or_prefix)
 
 
 class Draft:

@@ -109,6 +109,7 @@ def _compute(spec: Json, started: float, memory: PeakMemory) -> None:
     with store.draft(spec["identity"]["stage"], spec["key"]) as draft:
         _write(draft, stage(settings, *products), spec)
         run = {
+            **spec["circumstances"],
             "coordinate": spec["coordinate"],
             "finished_unix_s": time.time(),
             "host": socket.gethostname(),
