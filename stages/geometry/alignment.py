@@ -36,13 +36,15 @@ def travelled(T: F8) -> F8:
 def absolute_errors(truth: F8, estimate: F8) -> F8:
     """Distance (n,) of every position to truth after the best rigid alignment of the whole, m."""
     t, e = truth[:, :3, 3], estimate[:, :3, 3]
-    return np.linalg.norm(t - transform(umeyama(t, e), e), axis=1)
+    distance: F8 = np.linalg.norm(t - transform(umeyama(t, e), e), axis=1)
+    return distance
 
 
 def errors_from_start(truth: F8, estimate: F8) -> F8:
     """Distance (n,) of every position to truth when the first poses are laid over each other, m."""
     moved = truth[0] @ inverse(estimate[0]) @ estimate
-    return np.linalg.norm(truth[:, :3, 3] - moved[:, :3, 3], axis=1)
+    distance: F8 = np.linalg.norm(truth[:, :3, 3] - moved[:, :3, 3], axis=1)
+    return distance
 
 
 def rms(values: F8) -> float:

@@ -7,6 +7,8 @@ Droeschel and Behnke 2018 use the same figure. Values of tools that define the c
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -59,7 +61,8 @@ class _Columns:
 
 
 @kernel
-def _counting_sort(cell, cells):  # type: ignore[no-untyped-def]
+def _counting_sort(cell: NDArray[np.int64], cells: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Where each cell starts (cells + 1,), and the points ordered by cell (n,)."""
     starts = np.zeros(cells + 1, np.int64)
     for c in cell:
         starts[c + 1] += 1
@@ -74,13 +77,16 @@ def _counting_sort(cell, cells):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _entropies(points, starts, shape, low, size_m, queries, radii, min_neighbours):  # type: ignore[no-untyped-def]
+def _entropies(
+    points: NDArray[np.float32], starts: NDArray[np.int64], shape: NDArray[np.int64], low: F8, size_m: float,
+    queries: NDArray[np.float32], radii: F8, min_neighbours: int,
+) -> F8:  # fmt: skip
     out = np.full((len(queries), len(radii)), np.nan)
     squared_radii = radii * radii
     for i in range(len(queries)):
         sums = np.zeros((len(radii), 10))  # count, x y z, xx xy xz yy yz zz about the query
-        cx = np.int64(np.floor((queries[i, 0] - low[0]) / size_m))
-        cy = np.int64(np.floor((queries[i, 1] - low[1]) / size_m))
+        cx: Any = np.int64(np.floor((queries[i, 0] - low[0]) / size_m))
+        cy: Any = np.int64(np.floor((queries[i, 1] - low[1]) / size_m))
         for gx in range(max(cx - 1, 0), min(cx + 2, shape[0])):
             first = gx * shape[1]
             begin = starts[first + max(cy - 1, 0)]
@@ -95,7 +101,9 @@ def _entropies(points, starts, shape, low, size_m, queries, radii, min_neighbour
 
 
 @kernel
-def _gather(points, begin, end, query, squared_radii, sums):  # type: ignore[no-untyped-def]
+def _gather(
+    points: NDArray[np.float32], begin: Any, end: Any, query: NDArray[np.float32], squared_radii: F8, sums: F8
+) -> None:
     """Add each point to the moments of the smallest radius that holds it; radii increase."""
     for j in range(begin, end):
         x = float(points[j, 0]) - float(query[0])
@@ -118,7 +126,7 @@ def _gather(points, begin, end, query, squared_radii, sums):  # type: ignore[no-
 
 
 @kernel
-def _entropy(m):  # type: ignore[no-untyped-def]
+def _entropy(m: F8) -> Any:
     """1/2 ln det(2 pi e Sigma) from moments; NaN when Sigma is singular to rounding."""
     n = m[0]
     x, y, z = m[1] / n, m[2] / n, m[3] / n

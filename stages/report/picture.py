@@ -81,7 +81,8 @@ def _ground(low: NDArray[np.float32], step: int, shape: tuple[int, int]) -> NDAr
     filled = low[tuple(nearest)]
     smooth = ndimage.gaussian_filter(ndimage.minimum_filter(filled, 3), 1.5)
     fine = np.repeat(np.repeat(smooth, step, axis=0), step, axis=1)[: shape[0], : shape[1]]
-    return ndimage.uniform_filter(fine, step).astype(np.float32)
+    ground: NDArray[np.float32] = ndimage.uniform_filter(fine, step).astype(np.float32)
+    return ground
 
 
 def _stretch(bright: NDArray[np.float32], filled: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -105,11 +106,17 @@ def _shade(
     colour *= np.where(above < 0.4, 0.55 + 0.9 * bright, 1.0)[..., None] * light[..., None]
     empty = ~np.isfinite(top)
     colour[empty] = BACKGROUND
-    return np.clip(colour, 0, 255).astype(np.uint8)
+    image: NDArray[np.uint8] = np.clip(colour, 0, 255).astype(np.uint8)
+    return image
 
 
 @kernel
-def _splat(xs, ys, zs, z0, intensity, classes, ground, left, bottom, pixel_m, step, top, bright, low):  # type: ignore[no-untyped-def]
+def _splat(
+    xs: NDArray[np.float32], ys: NDArray[np.float32], zs: NDArray[np.float32], z0: float,
+    intensity: NDArray[np.float32], classes: NDArray[np.uint8], ground: int, left: float, bottom: float,
+    pixel_m: float, step: int, top: NDArray[np.float32], bright: NDArray[np.float32], low: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Keep per pixel the highest point and the brightest ground, and per coarse cell the lowest point."""
     height, width = top.shape
     for i in range(len(xs)):
         px = np.int64(np.floor((xs[i] + left) / pixel_m))
@@ -126,7 +133,7 @@ def _splat(xs, ys, zs, z0, intensity, classes, ground, left, bottom, pixel_m, st
 
 
 @kernel
-def _depth_light(top, pixel_m):  # type: ignore[no-untyped-def]
+def _depth_light(top: NDArray[np.float32], pixel_m: float) -> NDArray[np.float32]:
     """Eye-dome lighting (Boucheny 2009): a pixel is darker the more its neighbours stand above it."""
     height, width = top.shape
     light = np.ones((height, width), np.float32)

@@ -63,7 +63,8 @@ def merge(pieces: list[Piece]) -> Piece:
 def _keys(voxel: NDArray[np.int32]) -> NDArray[np.int64]:
     """One number per voxel that orders as (x, y, z); x and y are below 1024, z within 2^30 of zero."""
     x, y, z = voxel.astype(np.int64).T
-    return (x << 42) | (y << 32) | (z + (1 << 30))
+    keys: NDArray[np.int64] = (x << 42) | (y << 32) | (z + (1 << 30))
+    return keys
 
 
 def _sum_runs(values: NDArray, order: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray:

@@ -7,12 +7,16 @@ in doubles, so that the map does not depend on the order in which scans, chunks 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.schemas.errors import StageError
 from scanloom.stages.geometry.kernels import kernel
+
+Int = int | np.integer[Any]
+"""A whole number inside a kernel, where numpy scalars pass for Python's."""
 
 STEP_M = 2.0**-13
 """Rounding of coordinates, 0.12 mm: a hundredth of a good LiDAR's noise."""
@@ -52,9 +56,8 @@ class VoxelSums:
         self._voxel_m = voxel_size_m
         self._tile_m = tile_size_m
         self._side = round(tile_size_m / voxel_size_m)
-        self._keys = np.empty(0, np.int64)
-        self._records = np.empty((0, 8))
         self._used = 0
+        self._dense_keys, self._records = np.empty(0, np.int64), np.empty((0, 8))
         self._scans = 0
         self._rehash(1 << 16)
 
@@ -110,11 +113,11 @@ class VoxelSums:
             self._rehash(slots)
 
     def _rehash(self, slots: int) -> None:
+        """A table of so many slots, and dense arrays half as long."""
         dense_keys = np.empty(slots // 2, np.int64)
         records = np.zeros((slots // 2, 8))
-        if self._used:
-            dense_keys[: self._used] = self._dense_keys[: self._used]
-            records[: self._used] = self._records[: self._used]
+        dense_keys[: self._used] = self._dense_keys[: self._used]
+        records[: self._used] = self._records[: self._used]
         self._dense_keys, self._records = dense_keys, records
         self._keys = np.full(slots, _EMPTY, np.int64)
         self._slots = np.empty(slots, np.int32)
@@ -143,14 +146,17 @@ def _tile_sums(keys: NDArray[np.int64], records: NDArray[np.float64]) -> TileSum
 
 
 @kernel
-def _hash(key, mask):  # type: ignore[no-untyped-def]
+def _hash(key: Int, mask: Int) -> Int:
     """Fibonacci hashing: the high bits of key * 2^64/phi."""
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     return np.int64((mixed >> np.uint64(24)) & np.uint64(mask))
 
 
 @kernel
-def _insert_all(dense_keys, used, keys, slots):  # type: ignore[no-untyped-def]
+def _insert_all(
+    dense_keys: NDArray[np.int64], used: int, keys: NDArray[np.int64], slots: NDArray[np.int32]
+) -> None:
+    """Fill an empty table with the voxels known so far."""
     mask = len(keys) - 1
     for i in range(used):
         at = _hash(dense_keys[i], mask)
@@ -161,10 +167,13 @@ def _insert_all(dense_keys, used, keys, slots):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _accumulate(  # type: ignore[no-untyped-def]
-    xs, ys, zs, intensity, classes, keep, ground_class, T, voxel_m, tile_m, side, scan,
-    keys, slots, dense_keys, records, used,
-):  # fmt: skip
+def _accumulate(
+    xs: NDArray[np.float32], ys: NDArray[np.float32], zs: NDArray[np.float32], intensity: NDArray[np.float32],
+    classes: NDArray[np.uint8], keep: NDArray[np.bool_], ground_class: int, T: NDArray[np.float64],
+    voxel_m: float, tile_m: float, side: int, scan: int,
+    keys: NDArray[np.int64], slots: NDArray[np.int32], dense_keys: NDArray[np.int64], records: NDArray[np.float64],
+    used: int,
+) -> int:  # fmt: skip
     """Sum the points of one scan; returns the number of voxels, or -1 when a point is out of the grid."""
     mask = len(keys) - 1
     for i in range(len(xs)):
@@ -181,8 +190,8 @@ def _accumulate(  # type: ignore[no-untyped-def]
         if abs(tx) >= _TILE_HALF or abs(ty) >= _TILE_HALF or abs(vz) >= _HEIGHT_HALF:
             return -1
         # Rounding of the quotient may touch the upper border, which belongs to the tile's last voxel.
-        vx = min(max(np.int64(x / voxel_m), 0), side - 1)
-        vy = min(max(np.int64(y / voxel_m), 0), side - 1)
+        vx: Any = min(max(np.int64(x / voxel_m), 0), side - 1)
+        vy: Any = min(max(np.int64(y / voxel_m), 0), side - 1)
         tile = ((np.int64(tx) + _TILE_HALF) << _TILE_BITS) | (np.int64(ty) + _TILE_HALF)
         inner = (((vx << _SIDE_BITS) | vy) << _HEIGHT_BITS) | (np.int64(vz) + _HEIGHT_HALF)
         key = (tile << _TILE_SHIFT) | inner

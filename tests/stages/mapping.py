@@ -110,7 +110,9 @@ class Source:
     pieces: list[Part[Piece]]
 
 
-def tiles_of(sources: Sequence[Source], settings: TilesSettings | None = None) -> dict[str, tuple[Tile, TileFiles]]:
+def tiles_of(
+    sources: Sequence[Source], settings: TilesSettings | None = None
+) -> dict[str, tuple[Tile, TileFiles]]:
     """Merge the pieces tile by tile, as the engine does."""
     found: dict[str, list[Any]] = {}
     for source in sources:
