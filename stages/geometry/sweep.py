@@ -6,10 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
 from scanloom.stages.geometry.kernels import kernel
 
 TURN = 2 * np.pi
 CLOCKWISE, COUNTER_CLOCKWISE = -1, 1
+LARGEST_STEP_RAD = np.radians(20.0)
+"""Mean azimuth step from point to point in firing order; beams of one direction differ by a few degrees."""
 REAR_RAD = np.pi
 """Where a sweep starts when nothing tells: behind the vehicle, as drivers and data sets cut it."""
 
@@ -58,21 +61,23 @@ def _wrap(angle: float) -> float:
 
 
 @kernel
-def _progress(x: NDArray[np.float32], y: NDArray[np.float32]) -> tuple[float, float]:
-    """Sum of the azimuth steps from point to point, rad, and the azimuth of the first point."""
-    total, first, last = 0.0, 0.0, 0.0
-    started = False
+def _progress(x: NDArray[np.float32], y: NDArray[np.float32]) -> tuple[float, float, float, int]:
+    """Sum of the azimuth steps from point to point and of their sizes, rad, first azimuth, number of steps."""
+    total, size, first, last = 0.0, 0.0, 0.0, 0.0
+    count = 0
     for i in range(len(x)):
         if not (abs(x[i]) + abs(y[i]) > 0.0):
             continue
         azimuth = _azimuth(y[i], x[i])
-        if started:
-            total += _wrap(azimuth - last)
-        else:
-            started = True
+        if count == 0:
             first = azimuth
+        else:
+            step = _wrap(azimuth - last)
+            total += step
+            size += abs(step)
         last = azimuth
-    return total, first
+        count += 1
+    return total, size, first, max(count - 1, 0)
 
 
 @kernel
@@ -127,15 +132,28 @@ def detect_sweep(x: NDArray[np.float32], y: NDArray[np.float32]) -> Sweep:
     ----------
     x, y : (n,) coordinates in the LiDAR's frame, m, in the order of the log; NaN and zero points are skipped.
 
-    Azimuth steps from point to point telescope: about one turn in all means points in firing order, several turns mean
-    one beam after the other; the sign is the direction. Without a clear answer: clockwise from the rear.
+    Azimuth steps from point to point telescope: about one turn in all, in small steps, means points in firing order;
+    several turns with hardly a step back mean one beam after the other. The sign is the direction, the first point the
+    seam. Any other order (shuffled, filtered) tells nothing: clockwise from the rear is taken.
     """
-    total, first = _progress(x, y)
-    turns = total / TURN
-    if abs(turns) < 0.4:
-        return Sweep(CLOCKWISE, REAR_RAD, False, False)
-    direction = COUNTER_CLOCKWISE if turns > 0 else CLOCKWISE
-    return Sweep(direction, first, abs(turns) < 1.6, True)
+    total, size, first, steps = _progress(x, y)
+    turns = abs(total) / TURN
+    direction = COUNTER_CLOCKWISE if total > 0 else CLOCKWISE
+    if steps > 0 and 0.6 < turns < 1.6 and size / steps < LARGEST_STEP_RAD:
+        return Sweep(direction, first, in_firing_order=True, detected=True)
+    if turns >= 1.6 and abs(total) > 0.8 * size:
+        return Sweep(direction, first, in_firing_order=False, detected=True)
+    return Sweep(CLOCKWISE, REAR_RAD, in_firing_order=False, detected=False)
+
+
+def reaches_around(x: NDArray[np.float32], y: NDArray[np.float32]) -> bool:
+    """Whether the points lie all around the sensor: in at least 27 of 36 sectors."""
+    sample = slice(None, None, max(1, len(x) // 4000))
+    with np.errstate(invalid="ignore"):
+        azimuth = np.arctan2(y[sample], x[sample])
+    hit = np.isfinite(azimuth) & ((x[sample] != 0) | (y[sample] != 0))
+    sectors = np.unique(((azimuth[hit] + np.pi) * (36 / TURN)).astype(int) % 36)
+    return len(sectors) >= 27
 
 
 def sweep_times(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.schemas.errors import InvalidInput
-from scanloom.stages.geometry.sweep import detect_sweep, elevation_trend, sweep_times
+from scanloom.stages.geometry.sweep import detect_sweep, elevation_trend, reaches_around, sweep_times
 from scanloom.stages.logs.records import Cloud, LivoxCloud, PointCloud2, PointField
 
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8", 9: "i8", 10: "u8"}
@@ -115,8 +115,11 @@ def azimuth_times(cloud: Cloud, period_ns: int) -> NDArray[np.int64]:
     """Time (n,) of each point since the start of its sweep, ns in [0, period_ns), from its azimuth.
 
     The turn is the cloud's own (`cloud.sweep`) where the format is known, else it is read from the order of the points.
+    Where neither tells and the points do not reach around (a sensor that does not spin), all get the middle.
     """
     sweep = cloud.sweep or detect_sweep(cloud.x_m, cloud.y_m)
+    if not sweep.detected and not reaches_around(cloud.x_m, cloud.y_m):
+        return np.full(len(cloud.x_m), period_ns // 2, np.int64)
     return sweep_times(cloud.x_m, cloud.y_m, period_ns, sweep)
 
 
@@ -220,6 +223,8 @@ def _rings(
     if trend > -0.8:
         return ring, ""
     top = int(ring.max())
+    if int(ring.min()) == 1 and top in BEAM_COUNTS:
+        ring, top = ring - np.uint16(1), top - 1
     beams = next((count for count in BEAM_COUNTS if count > top), top + 1)
     return np.uint16(beams - 1) - ring, "beams are numbered from above; turned so that 0 is the lowest"
 
@@ -285,17 +290,14 @@ def _range(
 def _unit(dtype: np.dtype[Any], low: float, high: float) -> tuple[_Unit | None, bool]:
     """The unit in which the span of the values is a sweep, and whether it is not what the type suggests.
 
-    Drivers write floats in seconds and integers in nanoseconds; that is kept for spans too short to tell.
+    Drivers write floats in seconds and integers in nanoseconds (Livox doubles too); that is kept for spans too short to
+    tell. At most one unit fits, for the longest sweep is less than a thousand times the shortest.
     """
-    usual = UNITS[0] if dtype.kind == "f" and abs(high) < 1e11 else UNITS[3]
+    usual = UNITS[0] if dtype.kind == "f" and abs(high) < 1e15 else UNITS[3]
     span = high - low
-    if span * usual.ns <= LONGEST_SWEEP_NS and (
-        span * usual.ns >= SHORTEST_SWEEP_NS or (dtype.kind == "f" and usual.ns == 1e9)
-    ):
-        return usual, False
     for unit in UNITS:
         if SHORTEST_SWEEP_NS <= span * unit.ns <= LONGEST_SWEEP_NS:
-            return unit, unit is not usual and not (dtype.kind == "f" and unit is UNITS[3] and high > 1e15)
+            return unit, unit is not usual
     return (usual, False) if span * usual.ns < SHORTEST_SWEEP_NS else (None, True)
 
 
