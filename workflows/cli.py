@@ -41,7 +41,8 @@ ProjectOption = Annotated[
 
 def main() -> None:
     """Entry point: errors become one clear sentence and an exit code."""
-    logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
+    logging.getLogger("scanloom").setLevel(logging.INFO)
     try:
         app(standalone_mode=False)
     except ScanloomError as error:
@@ -97,7 +98,7 @@ def map_command(
     as_json: JsonOption = False,
 ) -> None:
     """Logs into a map: trajectory, tiles, metrics and a report."""
-    from scanloom.pipeline.progress import for_terminal
+    from scanloom.pipeline.progress import progress_for
     from scanloom.workflows.build_map import Order, build_map, plan_map
     from scanloom.workflows.configuration import command_line_settings, project_settings
     from scanloom.workflows.sessions import map_name
@@ -117,8 +118,7 @@ def map_command(
     if dry_run:
         _show_plan(*plan_map(order), as_json)
         return
-    with for_terminal() as progress:
-        outcome = build_map(order, progress)
+    outcome = build_map(order, progress_for(sys.stderr))
     _show_outcome(outcome, as_json)
     raise typer.Exit(outcome.exit_code)
 
@@ -221,13 +221,12 @@ def nightly(
     as_json: JsonOption = False,
 ) -> None:
     """Many logs, many maps, one summary; a bad log never stops the night."""
-    from scanloom.pipeline.progress import for_terminal
+    from scanloom.pipeline.progress import progress_for
     from scanloom.workflows.nightly import run_fleet
 
-    with for_terminal() as progress:
-        night = run_fleet(
-            fleet, out, _store_folder(store), cluster=cluster, workers=workers, progress=progress
-        )
+    night = run_fleet(
+        fleet, out, _store_folder(store), cluster=cluster, workers=workers, progress=progress_for(sys.stderr)
+    )
     for row in night.failures:
         _say(f"scanloom: {row}")
     if as_json:

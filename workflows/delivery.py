@@ -100,16 +100,16 @@ def metric_rows(metrics: Metrics) -> list[Metric]:
 
 def _items(result: Result) -> Iterable[Item]:
     sessions = result.parts(Session)
-    for coordinate, path in result.files(MapFiles):
+    for _, path in result.files(MapFiles):
         yield Item("map.ply", path / "map.ply")
     for coordinate, path in result.files(Tile):
-        yield Item(f"tiles/{coordinate['tile']}.parquet", path)
+        yield Item(f"tiles/{dict(coordinate)['tile']}.parquet", path)
     for coordinate, path in result.files(TileFiles):
-        yield Item(f"tiles/{coordinate['tile']}.ply", path / "tile.ply")
+        yield Item(f"tiles/{dict(coordinate)['tile']}.ply", path / "tile.ply")
     for _, path in result.files(TileIndex):
         yield Item("tiles/index.parquet", path)
     for coordinate, path in result.files(Poses):
-        stem = "trajectory" if len(sessions) == 1 else f"trajectory/{coordinate['session']}"
+        stem = "trajectory" if len(sessions) == 1 else f"trajectory/{dict(coordinate)['session']}"
         yield Item(f"{stem}.parquet", path)
         yield Item(f"{stem}.tum", trajectory_tum(Poses.open(path)))
     for _, path in result.files(ReportFiles):
@@ -131,7 +131,7 @@ def trajectory_tum(poses: Poses) -> bytes:
 
 def _description(result: Result, name: str) -> dict[str, Any]:
     index = result.parts(TileIndex)[0]
-    keys = {coordinate["session"]: path.parent.name for coordinate, path in result.files(Session)}
+    keys = {dict(coordinate)["session"]: path.parent.name for coordinate, path in result.files(Session)}
     sessions = [
         {
             "name": s.name,

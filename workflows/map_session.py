@@ -16,7 +16,8 @@ from scanloom.stages.deskew import deskew
 from scanloom.stages.evaluation import evaluation
 from scanloom.stages.fusion import fusion
 from scanloom.stages.ingest import ingest
-from scanloom.stages.loops import loops, places
+from scanloom.stages.loops.closing import loops
+from scanloom.stages.loops.places import places
 from scanloom.stages.odometry import odometry
 from scanloom.stages.report import report
 from scanloom.stages.simulate import simulate
