@@ -42,6 +42,9 @@ class Settings(BaseModel):
     point_time: Literal["auto", "azimuth", "none"] = Field(
         "auto", description="auto: from the points, else from azimuth; none: every point has its scan's stamp"
     )
+    vertical_correction_deg: float = Field(
+        0.0, ge=-2, le=2, description="raises every beam; 0.205 for KITTI's HDL-64E (IMLS-SLAM, 2018), deg"
+    )
     align_clocks: bool = Field(
         True,
         description="shift a sensor whose clock differs from the LiDAR's by more than a second, using receive times",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path, PurePosixPath
+
 from scanloom.schemas.errors import InvalidInput
 from scanloom.schemas.session import RawLog
 from scanloom.stages.logs.bags import open_bags
@@ -34,3 +36,15 @@ def open_log(raw_log: RawLog, rate_hz: float = 10.0) -> LogSource:
 
         return open_point_files(raw_log, rate_hz)
     return open_bags(raw_log, found)
+
+
+def describe_place(raw_log: RawLog) -> str:
+    """The file or folder, for messages."""
+    root = raw_log.root or Path()
+    return str(root / raw_log.names[0]) if len(raw_log.names) == 1 else str(root)
+
+
+def session_name(raw_log: RawLog) -> str:
+    """A name that depends on the names inside the log only, so that a moved log gives the same bytes."""
+    first = PurePosixPath(raw_log.names[0])
+    return first.parts[0] if len(first.parts) > 1 else first.stem

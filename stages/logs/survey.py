@@ -18,21 +18,19 @@ from scanloom.stages.logs.checks import GRAVITY_M_S2, gnss_problems, imu_problem
 from scanloom.stages.logs.mounting import TfTree, resolve
 from scanloom.stages.logs.options import Settings
 from scanloom.stages.logs.records import (
-    CloudFile,
     GnssSample,
     ImuSample,
-    LivoxCloud,
     LogSource,
     Message,
-    PointCloud2,
+    TopicInfo,
     Transforms,
     Undecodable,
     WheelSample,
 )
 from scanloom.stages.logs.roles import ROLES, Roles
+from scanloom.stages.logs.sweeps import ScanTally
 
 I8 = NDArray[np.int64]
-PointTime = Literal["per point", "from azimuth", "none"]
 _CLOCK_APART_NS = 1_000_000_000
 
 
@@ -55,20 +53,6 @@ class _Track:
         return float(np.median(np.subtract(self.header_ns, self.receive_ns))) if self.header_ns else 0.0
 
 
-@dataclass
-class ScanTally:
-    """What ingest counts while it makes scans."""
-
-    scans: int = 0
-    points: int = 0
-    no_return: int = 0
-    first_ns: int = 0
-    last_ns: int = 0
-    beams: int = 0
-    point_time: PointTime = "per point"
-    problems: list[Problem] = field(default_factory=list)
-
-
 class Survey:
     """Takes in the messages of the used topics one by one; clouds are looked at by their headers only."""
 
@@ -85,6 +69,11 @@ class Survey:
     def topics(self) -> set[str]:
         """Topics that must be read: those in use, and transforms."""
         return set(self._role) | {topic.name for topic in self.source.topics if topic.kind == "tf"}
+
+    def period_ns(self) -> int:
+        """Duration of a sweep, from the rate at which the LiDAR's messages come."""
+        found = next((topic.period_ns for topic in self.source.topics if topic.name == self.roles.lidar), 0)
+        return found or round(1e9 / self.settings.scan_rate_hz)
 
     def note(self, message: Message) -> None:
         """Take in one message."""
@@ -192,10 +181,8 @@ class Survey:
         """The summary of the log, after its last message."""
         frames = {role: self.tracks[role].frame for role in ROLES if self.tracks[role].header_ns}
         extrinsics, assumed = resolve(self.tf, frames, self.settings.mountings(), self.source.extrinsics)
-        lidar = self.roles.lidar
-        period = next((t.period_ns for t in self.source.topics if t.name == lidar), 0)
-        if len(self.tracks["lidar"].header_ns) > 1:
-            period = int(np.median(np.diff(np.unique(self.tracks["lidar"].header_ns))))
+        stamps = np.unique(self.tracks["lidar"].header_ns)
+        period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
         problems = [
             *self._damage(),
             *self.source.problems,
@@ -277,7 +264,7 @@ class Survey:
                 type=topic.type,
                 role=_role(self._role.get(topic.name), topic.kind),
                 messages=topic.count,
-                rate_hz=1e9 / topic.period_ns if topic.period_ns else 0.0,
+                rate_hz=_rate_hz(topic),
                 first_ns=topic.first_ns,
                 last_ns=topic.last_ns,
                 remark=topic.remark,
@@ -298,4 +285,7 @@ def _role(used: str | None, kind: str) -> TopicRole:
     return "images" if kind == "images" else "unused"
 
 
-CLOUDS = (PointCloud2, LivoxCloud, CloudFile)
+def _rate_hz(topic: TopicInfo) -> float:
+    """Mean rate; bursts do not raise it."""
+    span_ns = topic.last_ns - topic.first_ns
+    return (topic.count - 1) * 1e9 / span_ns if span_ns > 0 else 0.0

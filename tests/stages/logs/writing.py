@@ -18,7 +18,7 @@ ROS1 = get_typestore(Stores.ROS1_NOETIC)
 ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 START_NS = 1_700_000_000_000_000_000
 SCAN_NS = 100_000_000
-ROWS, COLUMNS = 4, 32
+ROWS, COLUMNS = 4, 96
 DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")])
 
 
