@@ -28,4 +28,5 @@ def inside(stamp_ns: NDArray[np.int64], at_ns: NDArray[np.int64]) -> NDArray[np.
     """Which of the times `at_ns` lie within the range of `stamp_ns`."""
     if len(stamp_ns) == 0:
         return np.zeros(len(at_ns), bool)
-    return (at_ns >= stamp_ns[0]) & (at_ns <= stamp_ns[-1])
+    within: NDArray[np.bool_] = (at_ns >= stamp_ns[0]) & (at_ns <= stamp_ns[-1])
+    return within

@@ -14,13 +14,17 @@ F8 = NDArray[np.float64]
 _SMALL = 1e-8
 
 
+def _f8(values: ArrayLike) -> F8:
+    return np.asarray(values, np.float64)
+
+
 def hat(w: ArrayLike) -> F8:
     """Skew matrix (..., 3, 3) with hat(w) @ v = w x v."""
-    w = np.asarray(w, float)
-    out = np.zeros((*w.shape[:-1], 3, 3))
-    out[..., 0, 1], out[..., 0, 2] = -w[..., 2], w[..., 1]
-    out[..., 1, 0], out[..., 1, 2] = w[..., 2], -w[..., 0]
-    out[..., 2, 0], out[..., 2, 1] = -w[..., 1], w[..., 0]
+    omega = _f8(w)
+    out = np.zeros((*omega.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -omega[..., 2], omega[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = omega[..., 2], -omega[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -omega[..., 1], omega[..., 0]
     return out
 
 
@@ -36,9 +40,9 @@ def _coefficients(angle: F8) -> tuple[F8, F8, F8]:
 
 def so3_exp(w: ArrayLike) -> F8:
     """Rotation matrix (..., 3, 3) of the rotation vector w (..., 3), rad."""
-    w = np.asarray(w, float)
-    a, b, _ = _coefficients(np.linalg.norm(w, axis=-1))
-    K = hat(w)
+    omega = _f8(w)
+    a, b, _ = _coefficients(np.linalg.norm(omega, axis=-1))
+    K = hat(omega)
     return np.eye(3) + a[..., None, None] * K + b[..., None, None] * (K @ K)
 
 
@@ -48,14 +52,16 @@ def so3_log(R: ArrayLike) -> F8:
     vector = q[..., 1:]
     sine = np.linalg.norm(vector, axis=-1)
     angle = 2 * np.arctan2(sine, q[..., 0])
-    scale = np.where(sine < _SMALL, 2.0 / np.maximum(q[..., 0], _SMALL), angle / np.where(sine < _SMALL, 1.0, sine))
+    scale = np.where(
+        sine < _SMALL, 2.0 / np.maximum(q[..., 0], _SMALL), angle / np.where(sine < _SMALL, 1.0, sine)
+    )
     return vector * scale[..., None]
 
 
 def se3_exp(xi: ArrayLike) -> F8:
     """Pose (..., 4, 4) of the tangent xi (..., 6) = (rotation, translation)."""
-    xi = np.asarray(xi, float)
-    w, v = xi[..., :3], xi[..., 3:]
+    tau = _f8(xi)
+    w, v = tau[..., :3], tau[..., 3:]
     _, b, c = _coefficients(np.linalg.norm(w, axis=-1))
     K = hat(w)
     V = np.eye(3) + b[..., None, None] * K + c[..., None, None] * (K @ K)
@@ -64,56 +70,58 @@ def se3_exp(xi: ArrayLike) -> F8:
 
 def se3_log(T: ArrayLike) -> F8:
     """Tangent (..., 6) = (rotation, translation) of the pose T (..., 4, 4)."""
-    T = np.asarray(T, float)
-    w = so3_log(T[..., :3, :3])
+    P = _f8(T)
+    w = so3_log(P[..., :3, :3])
     _, b, c = _coefficients(np.linalg.norm(w, axis=-1))
     K = hat(w)
     V = np.eye(3) + b[..., None, None] * K + c[..., None, None] * (K @ K)
-    v = np.linalg.solve(V, T[..., :3, 3:])[..., 0]
+    v = np.linalg.solve(V, P[..., :3, 3:])[..., 0]
     return np.concatenate((w, v), axis=-1)
 
 
 def pose(R: ArrayLike, t: ArrayLike) -> F8:
     """Pose (..., 4, 4) from rotation (..., 3, 3) and translation (..., 3), m."""
-    R, t = np.asarray(R, float), np.asarray(t, float)
-    out = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
-    out[..., :3, :3] = R
-    out[..., :3, 3] = t
+    M, p = _f8(R), _f8(t)
+    out = np.zeros((*np.broadcast_shapes(M.shape[:-2], p.shape[:-1]), 4, 4))
+    out[..., :3, :3] = M
+    out[..., :3, 3] = p
     out[..., 3, 3] = 1.0
     return out
 
 
 def inverse(T: ArrayLike) -> F8:
     """Inverse pose (..., 4, 4)."""
-    T = np.asarray(T, float)
-    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
-    return pose(Rt, -np.einsum("...ij,...j->...i", Rt, T[..., :3, 3]))
+    P = _f8(T)
+    Rt = np.swapaxes(P[..., :3, :3], -1, -2)
+    return pose(Rt, -np.einsum("...ij,...j->...i", Rt, P[..., :3, 3]))
 
 
 def transform(T: ArrayLike, points: ArrayLike) -> F8:
     """Points (n, 3) of frame b in frame a, for one pose T_a_b (4, 4)."""
-    T = np.asarray(T, float)
-    return np.asarray(points, float) @ T[:3, :3].T + T[:3, 3]
+    P = _f8(T)
+    return np.asarray(points, float) @ P[:3, :3].T + P[:3, 3]
 
 
 def adjoint(T: ArrayLike) -> F8:
     """Ad(T) (..., 6, 6): T Exp(xi) T^-1 = Exp(Ad(T) xi), order (rotation, translation)."""
-    T = np.asarray(T, float)
-    R = T[..., :3, :3]
-    out = np.zeros((*T.shape[:-2], 6, 6))
+    P = _f8(T)
+    R = P[..., :3, :3]
+    out = np.zeros((*P.shape[:-2], 6, 6))
     out[..., :3, :3] = R
     out[..., 3:, 3:] = R
-    out[..., 3:, :3] = hat(T[..., :3, 3]) @ R
+    out[..., 3:, :3] = hat(P[..., :3, 3]) @ R
     return out
 
 
 def quaternion_from_matrix(R: ArrayLike) -> F8:
     """Unit quaternion (..., 4) as qw, qx, qy, qz with qw >= 0 (Shepperd's method: the largest term is the pivot)."""
-    R = np.asarray(R, float)
-    m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
-    squares = np.stack((1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22), -1)
-    xy, xz, yz = R[..., 1, 0] + R[..., 0, 1], R[..., 0, 2] + R[..., 2, 0], R[..., 2, 1] + R[..., 1, 2]
-    dx, dy, dz = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
+    M = _f8(R)
+    m00, m11, m22 = M[..., 0, 0], M[..., 1, 1], M[..., 2, 2]
+    squares = np.stack(
+        (1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22), -1
+    )
+    xy, xz, yz = M[..., 1, 0] + M[..., 0, 1], M[..., 0, 2] + M[..., 2, 0], M[..., 2, 1] + M[..., 1, 2]
+    dx, dy, dz = M[..., 2, 1] - M[..., 1, 2], M[..., 0, 2] - M[..., 2, 0], M[..., 1, 0] - M[..., 0, 1]
     rows = np.stack(
         (
             np.stack((squares[..., 0], dx, dy, dz), -1),
@@ -126,19 +134,20 @@ def quaternion_from_matrix(R: ArrayLike) -> F8:
     pivot = np.argmax(squares, axis=-1)
     q = np.take_along_axis(rows, pivot[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.where(q[..., :1] < 0, -q, q)
+    return _f8(np.where(q[..., :1] < 0, -q, q))
 
 
 def matrix_from_quaternion(q: ArrayLike) -> F8:
     """Rotation (..., 3, 3) of the quaternion (..., 4) as qw, qx, qy, qz; it need not be normalised."""
-    q = np.asarray(q, float)
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    w, v = q[..., 0], q[..., 1:]
+    u = _f8(q)
+    u = u / np.linalg.norm(u, axis=-1, keepdims=True)
+    w, v = u[..., 0], u[..., 1:]
     K = hat(v)
     return np.eye(3) + 2 * w[..., None, None] * K + 2 * (K @ K)
 
 
 def yaw_of(T: ArrayLike) -> F8:
     """Heading of a pose or rotation, rad in (-pi, pi], 0 along x, counter-clockwise."""
-    T = np.asarray(T, float)
-    return np.arctan2(T[..., 1, 0], T[..., 0, 0])
+    P = _f8(T)
+    heading: F8 = np.arctan2(P[..., 1, 0], P[..., 0, 0])
+    return heading
