@@ -15,3 +15,6 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"real data is absent: {SHARED_DATA.resolve()} does not exist")
     return SHARED_DATA.resolve()
+
+
+from tests.mapped import small  # noqa: E402, F401  (a fixture)

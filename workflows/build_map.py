@@ -14,7 +14,7 @@ from typing import Any
 
 import psutil
 
-from scanloom.pipeline.plan import PlannedTask, Request, SessionInput
+from scanloom.pipeline.plan import PlannedTask, Request
 from scanloom.pipeline.plan import plan as plan_tasks
 from scanloom.pipeline.progress import Progress
 from scanloom.pipeline.run import Result, run
@@ -64,7 +64,7 @@ class Outcome:
 
 def plan_map(order: Order) -> tuple[list[PlannedTask], list[tuple[str, ScanloomError]]]:
     """What `build_map` would do, and the logs it could not use; computes nothing."""
-    request, errors = _request(order)
+    request, errors = request_of(order)
     if not request.sessions:
         return [], errors
     return plan_tasks(request, Store(order.store)), errors
@@ -75,7 +75,7 @@ def build_map(order: Order, progress: Progress | None = None) -> Outcome:
 
     A log that cannot be used is reported and left out; the map is made of the others.
     """
-    request, errors = _request(order)
+    request, errors = request_of(order)
     if not request.sessions:
         return Outcome(order.out, _exit_code(errors, delivered=False), False, [], 0, errors, [])
     claim(order.out)
@@ -98,7 +98,8 @@ def build_map(order: Order, progress: Progress | None = None) -> Outcome:
     )
 
 
-def _request(order: Order) -> tuple[Request, list[tuple[str, ScanloomError]]]:
+def request_of(order: Order) -> tuple[Request, list[tuple[str, ScanloomError]]]:
+    """What the engine is asked to do, and the logs that cannot be used."""
     sessions, errors = find_sessions(order.sessions)
     with_command_line = tuple(
         dataclasses.replace(s, settings=merged(s.settings, order.command_line)) if s.settings else s
@@ -198,6 +199,3 @@ def _exit_code(failures: list[tuple[str, ScanloomError]], delivered: bool) -> in
     if not failures:
         return EXIT_OK if delivered else EXIT_INTERNAL
     return EXIT_SOME_FAILED if delivered else failures[0][1].exit_code
-
-
-__all__ = ["Order", "Outcome", "SessionInput", "build_map", "plan_map"]

@@ -1,0 +1,57 @@
+"""The small simulated session, mapped once per test run and shared by every test that needs a whole map."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from scanloom.pipeline.run import Result, run
+from scanloom.pipeline.store import Store
+from scanloom.workflows.build_map import Order, request_of
+
+SMALL = {"simulate": {"size": "small"}}
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """A finished run in a store of its own."""
+
+    result: Result
+    store: Store
+
+
+def order(folder: Path, cluster: str = "none") -> Order:
+    """The small sample, to be mapped below `folder`."""
+    return Order(
+        sessions=("sample",), out=folder / "out", name="sample", store=folder / "store", cluster=cluster,
+        command_line=SMALL,
+    )  # fmt: skip
+
+
+def map_small(folder: Path, cluster: str = "none", workers: int | None = None) -> Mapped:
+    """Run every stage on the small sample."""
+    request, errors = request_of(order(folder, cluster))
+    assert not errors
+    store = Store(folder / "store")
+    result = run(request, store, cluster=cluster, workers=workers)
+    assert not result.failures, [str(t.error) for t in result.failures]
+    return Mapped(result, store)
+
+
+@pytest.fixture(scope="session")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Mapped:
+    """The small sample mapped in this process; made once even when tests run side by side."""
+    shared = tmp_path_factory.getbasetemp().parent if os.environ.get("PYTEST_XDIST_WORKER") else tmp_path_factory.getbasetemp()
+    folder = shared / "small-sample"
+    # A second worker may be at it at the same time: the store takes the first writer's artifacts and both go on.
+    folder.mkdir(exist_ok=True)
+    return map_small(folder)
+
+
+def copy_store(mapped: Mapped, folder: Path) -> Store:
+    """A store with the same content that a test may damage."""
+    shutil.copytree(mapped.store.root, folder / "store")
+    return Store(folder / "store")
