@@ -37,7 +37,7 @@ def _order(role: str, topic: str, header_ns: I8, start_ns: int) -> Iterator[Prob
     if len(backwards):
         at = int(header_ns[backwards[0]])
         text = (
-            f"stamps run backwards {_times(len(backwards))}, by up to {-steps.min() / 1e9:.3g} s, "
+            f"has stamps that run backwards {_times(len(backwards))}, by up to {-steps.min() / 1e9:.3g} s, "
             f"first {_at(at, start_ns)}"
         )
         yield _problem(role, "backwards", "warning", text, topic, at)
@@ -90,7 +90,7 @@ def _clock(role: str, topic: str, header_ns: I8, receive_ns: I8, start_ns: int) 
     if kept:
         at = int(header_ns[kept[0]])
         size = float(lag[kept[0]] - lag[kept[0] + 1])
-        text = f"its clock jumps {_times(len(kept))}, first by {size:+.3g} s {_at(at, start_ns)}"
+        text = f"has a clock that jumps {_times(len(kept))}, first by {size:+.3g} s {_at(at, start_ns)}"
         yield _problem(role, "clock_jump", "warning", text, topic, at)
 
 

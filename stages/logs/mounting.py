@@ -83,6 +83,8 @@ def resolve(
             out.append(from_log[sensor])
         elif sensor in from_tf:
             out.append(Extrinsic(sensor=sensor, T_base_sensor=_tuple(from_tf[sensor]), source="tf"))
+        elif frames[sensor] in _BASES:
+            out.append(Extrinsic(sensor=sensor, T_base_sensor=IDENTITY, source="measured in the base"))
         else:
             out.append(Extrinsic(sensor=sensor, T_base_sensor=IDENTITY, source="assumed identity"))
             assumed.append(sensor)
@@ -125,7 +127,7 @@ def _problems(assumed: list[str], frames: Mapping[str, str], base: str) -> list[
             )
         )
     # with the LiDAR alone every base is as good as any other
-    if assumed and len(frames) > 1:
+    if assumed and len(frames) > 1 and "lidar" in frames:
         names = ", ".join(f"{sensor} (frame {frames[sensor] or 'unnamed'})" for sensor in assumed)
         options = " and ".join(f"ingest.{sensor}_on_base" for sensor in assumed)
         problems.append(

@@ -177,7 +177,9 @@ class ScanMaker:
             text = f"The points of {topic} {why}; it is derived from their azimuth, one turn in {self.period_ns / 1e6:.1f} ms."
             yield self._problem("no_point_time", "info", text)
         for remark, count in self._remarks.most_common(5):
-            yield self._problem("remark", "info", f"{topic}, {_count(count, 'scan')}: {remark}.")
+            yield self._problem(
+                "remark", "info", f"In {count} of {sum(self._kinds.values())} scans of {topic}: {remark}."
+            )
         if tally.scans and tally.points / tally.scans < _FEW_POINTS:
             text = f"The scans of {topic} have {tally.points / tally.scans:.0f} points on average; a 3D LiDAR has thousands."
             yield self._problem("sparse", "warning", text)

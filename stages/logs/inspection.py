@@ -1,0 +1,172 @@
+"""What is in a log, what would be used, what is wrong with it, and the one next thing to do; decodes three scans only."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from scanloom.schemas.errors import InvalidInput, ScanloomError
+from scanloom.schemas.session import Extrinsic, Problem, Session, Topic
+from scanloom.stages.logs.locate import locate
+from scanloom.stages.logs.options import Settings
+from scanloom.stages.logs.reader import open_log
+from scanloom.stages.logs.records import CloudFile, LivoxCloud, LogSource, PointCloud2
+from scanloom.stages.logs.roles import ROLES, assign_roles, no_lidar
+from scanloom.stages.logs.survey import Survey
+from scanloom.stages.logs.sweeps import CloudMessage, ScanMaker
+
+_LOOKED_AT = 3
+_MISSING = {
+    "imu": "no IMU: motion within a sweep comes from the scans themselves",
+    "gnss": "no GNSS: the map gets no georeference",
+    "wheel": "no wheel speed: nothing helps where the scans see no structure along the road",
+}
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """The findings; `as_json` makes plain values of them."""
+
+    path: str
+    name: str
+    format: str
+    size_bytes: int
+    files: int
+    usable: bool
+    """Whether `map` would start on it."""
+    complete: bool
+    duration_s: float
+    start_ns: int
+    end_ns: int
+    scans: int
+    points_per_scan: int
+    beams: int
+    point_time: str
+    topics: tuple[Topic, ...]
+    used: dict[str, str]
+    """Topic by role."""
+    missing: tuple[str, ...]
+    extrinsics: tuple[Extrinsic, ...]
+    truth: tuple[str, ...]
+    """Files with the true trajectory, for evaluation only."""
+    problems: tuple[Problem, ...]
+    next_step: str
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain dictionaries, lists, numbers and texts."""
+        plain = asdict(self)
+        for name in ("topics", "extrinsics", "problems"):
+            plain[name] = [entry.model_dump(mode="json") for entry in getattr(self, name)]
+        return plain
+
+
+def inspect_log(path: Path, settings: Settings | None = None) -> Inspection:
+    """Look at a log without computing anything.
+
+    Parameters
+    ----------
+    path : what the user calls a SESSION.
+    settings : settings of ingest given by the user; those of a session file stand behind them.
+
+    Raises
+    ------
+    InvalidInput : it is no log at all.
+    UsageError : the settings name a topic that the log does not have.
+    """
+    located = locate(path)
+    given = (settings or Settings()).model_dump(exclude_unset=True)
+    merged = Settings.model_validate({**located.settings.get("ingest", {}), **given})
+    source = open_log(located.raw_log, merged.scan_rate_hz)
+    session, error, used = _look(source, merged, str(path))
+    sizes = [(located.raw_log.root or Path()) / name for name in located.raw_log.names]
+    problems = session.problems if error is None else (*session.problems, _as_problem(error))
+    return Inspection(
+        path=str(path),
+        name=located.name,
+        format=located.format,
+        size_bytes=sum(file.stat().st_size for file in sizes),
+        files=len(sizes),
+        usable=error is None,
+        complete=session.complete,
+        duration_s=session.duration_s,
+        start_ns=session.start_ns,
+        end_ns=session.end_ns,
+        scans=session.scan_count,
+        points_per_scan=session.point_count,
+        beams=session.beams,
+        point_time=session.point_time,
+        topics=session.topics,
+        used=used,
+        missing=tuple(_MISSING[role] for role in _MISSING if role not in used) if "lidar" in used else (),
+        extrinsics=session.extrinsics,
+        truth=located.truth_log.names,
+        problems=problems,
+        next_step=_next_step(path, session, error),
+    )
+
+
+def _look(
+    source: LogSource, settings: Settings, where: str
+) -> tuple[Session, ScanloomError | None, dict[str, str]]:
+    """The session as ingest would find it, with points counted per scan; the error that ingest would raise."""
+    roles = assign_roles(source, settings.wanted_topics())
+    survey = Survey(source, roles, settings)
+    maker = ScanMaker(settings, roles.lidar, survey.period_ns())
+    clouds: list[CloudMessage] = []
+    for message in source.messages(survey.topics):
+        survey.note(message)
+        wanted = message.topic == roles.lidar and len(clouds) < _LOOKED_AT
+        if wanted and isinstance(message.body, PointCloud2 | LivoxCloud | CloudFile):
+            clouds.append(message.body)
+    readable = len(list(islice(maker.ordered(iter(clouds)), _LOOKED_AT)))
+    tally = maker.finish()
+    tally.points = tally.points // max(readable, 1)
+    stamps = survey.tracks["lidar"].header_ns
+    tally.scans = len(stamps) if readable else 0
+    if stamps:
+        tally.last_ns = max(tally.last_ns, max(stamps))
+    used = {role: roles.of(role) for role in ROLES if roles.of(role)}
+    error: InvalidInput | None = None
+    if not roles.lidar:
+        error = no_lidar(source, where)
+        tally.first_ns, tally.last_ns = _span(source)
+    elif readable < 2:
+        error = InvalidInput(
+            f"The log holds {readable} readable scan{'s' * (readable != 1)}; a map needs at least two.",
+            where=where,
+        )
+    return survey.session("", tally, survey.imu(), survey.gnss()), error, used
+
+
+def _span(source: LogSource) -> tuple[int, int]:
+    found = [topic for topic in source.topics if topic.count]
+    return min((t.first_ns for t in found), default=0), max((t.last_ns for t in found), default=0)
+
+
+def _as_problem(error: ScanloomError) -> Problem:
+    return Problem(code="log.unusable", severity="error", text=error.what)
+
+
+def _next_step(path: Path, session: Session, error: ScanloomError | None) -> str:
+    """The one thing to do next."""
+    if error is not None:
+        advice = error.next_step or "give another log"
+        return f"{advice[0].upper()}{advice[1:]}."
+    if not session.complete:
+        return f"Copy the log again if the original is whole; else map what there is: scanloom map {path}"
+    for problem in session.problems:
+        if problem.severity == "warning" and problem.code in _ADVICE:
+            return f"{_ADVICE[problem.code]} Then: scanloom map {path}"
+    return f"scanloom map {path}"
+
+
+_ADVICE = {
+    "lidar.ambiguous": "Choose the LiDAR with ingest.lidar_topic.",
+    "imu.no_overlap": "Bring the clocks together with ingest.imu_offset_s, or leave the IMU out (ingest.imu_topic=none).",
+    "imu.gravity": "Leave the IMU out (ingest.imu_topic=none).",
+    "imu.gyro_unit": "Check the unit of the gyro; leave the IMU out (ingest.imu_topic=none) if it is in degrees.",
+    "imu.gravity_axis": "Give the IMU's mounting with ingest.imu_on_base.",
+    "extrinsics.assumed": "Give the sensors' mounting if they are not close to the LiDAR.",
+}
