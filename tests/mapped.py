@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 from dataclasses import dataclass
@@ -46,9 +47,10 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Mapped:
     """The small sample mapped in this process; made once even when tests run side by side."""
     shared = tmp_path_factory.getbasetemp().parent if os.environ.get("PYTEST_XDIST_WORKER") else tmp_path_factory.getbasetemp()
     folder = shared / "small-sample"
-    # A second worker may be at it at the same time: the store takes the first writer's artifacts and both go on.
     folder.mkdir(exist_ok=True)
-    return map_small(folder)
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return map_small(folder)
 
 
 def copy_store(mapped: Mapped, folder: Path) -> Store:
