@@ -211,18 +211,13 @@ class Stream(Product, Generic[ItemT]):
 
 
 class _FileItems:
-    """Items of a stream in a file. Empty items have no row group of their own."""
+    """Items of a stream in a file: row group i is item i, also when it is empty."""
 
     def __init__(self, path: Path, item: type[Table], index: list[dict[str, Any]], through: Through = iter) -> None:
         self.path = path
         self._through = through
         self.item = item
         self.index = index
-        self._groups: list[int | None] = []
-        group = 0
-        for entry in index:
-            self._groups.append(group if entry["rows"] else None)
-            group += bool(entry["rows"])
 
     def __len__(self) -> int:
         return len(self.index)
@@ -243,12 +238,11 @@ class _FileItems:
 
     def _read(self, file: pq.ParquetFile, i: int) -> Table:
         attributes = {k: v for k, v in self.index[i].items() if k != "rows"}
-        group = self._groups[i]
-        if group is None:
+        if not self.index[i]["rows"]:
             return self.item.empty(**attributes)
         with _damage_named(self.path):
-            rows = file.read_row_group(group, use_threads=False)
-            return self.item.from_arrow(rows, attributes, f"{self.path}, row group {group}")
+            rows = file.read_row_group(i, use_threads=False)
+            return self.item.from_arrow(rows, attributes, f"{self.path}, row group {i}")
 
 
 class Document(BaseModel, Product):
