@@ -43,14 +43,8 @@ def _order(role: str, topic: str, header_ns: I8, start_ns: int) -> Iterator[Prob
         yield _problem(role, "backwards", "warning", text, topic, at)
     if len(same):
         at = int(header_ns[same[0]])
-        yield _problem(
-            role,
-            "duplicate",
-            "warning",
-            f"{_count(len(same), 'stamp')} the same as the one before",
-            topic,
-            at,
-        )
+        text = f"has {_count(len(same), 'message')} with the stamp of the one before"
+        yield _problem(role, "duplicate", "warning", text, topic, at)
 
 
 def _pace(role: str, topic: str, stamps: I8, start_ns: int) -> Iterator[Problem]:
