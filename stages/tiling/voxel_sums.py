@@ -83,19 +83,30 @@ class VoxelSums:
         ------
         StageError : a point lies further from the origin of the map than the grid reaches.
         """
-        points_x, points_y, points_z = points
+        n = len(points[0])
         self._scans += 1
-        self._grow_for(len(points_x))
-        self._used = _accumulate(
-            points_x, points_y, points_z, intensity, classes, keep, ground_class, T,
-            self._voxel_m, self._tile_m, self._side, self._scans,
-            self._table, self._keys, self._records, self._used,
-        )  # fmt: skip
-        if self._used < 0:
+        self._grow_for(n)
+        keys, steps, rows = np.empty(n, np.int64), np.empty((n, 5), np.float32), np.empty(n, np.int32)
+        kept = _quantise(
+            *points,
+            intensity,
+            classes,
+            keep,
+            ground_class,
+            T,
+            self._voxel_m,
+            self._tile_m,
+            self._side,
+            keys,
+            steps,
+        )
+        if kept < 0:
             raise StageError(
                 f"a point lies more than {_TILE_HALF * self._tile_m / 1000:.0f} km from the origin of the map",
                 next_step="look at the poses of this session: they have most likely diverged",
             )
+        self._used = _find(keys[:kept], rows, self._table, self._keys, self._used)
+        _add(rows[:kept], steps, self._records, self._scans)
 
     def tiles(self) -> list[TileSums]:
         """All voxels, tile by tile, ordered by tile and voxel."""
@@ -170,51 +181,82 @@ def _insert_all(keys: NDArray[np.int64], used: int, table: NDArray[np.int64]) ->
 
 
 @kernel
-def _accumulate(
+def _quantise(
     xs: NDArray[np.float32], ys: NDArray[np.float32], zs: NDArray[np.float32], intensity: NDArray[np.float32],
     classes: NDArray[np.uint8], keep: NDArray[np.bool_], ground_class: int, T: NDArray[np.float64],
-    voxel_m: float, tile_m: float, side: int, scan: int,
-    table: NDArray[np.int64], keys: NDArray[np.int64], records: NDArray[np.float64], used: int,
+    voxel_m: float, tile_m: float, side: int, keys: NDArray[np.int64], steps: NDArray[np.float32],
 ) -> int:  # fmt: skip
-    """Sum the points of one scan; returns the number of voxels, or -1 when a point is out of the grid."""
-    mask = len(table) - 1
-    last_key, record = np.int64(_EMPTY), np.int64(0)
+    """Voxel and rounded coordinates of the kept points of one scan.
+
+    Fills `keys` (n,) and `steps` (n, 5): x, y, z from the tile's corner and intensity in whole steps, 1 for ground;
+    returns their number, or -1 when a point is out of the grid.
+    """
+    kept = 0
     for i in range(len(xs)):
         if not keep[classes[i]]:
             continue
         x = T[0, 0] * xs[i] + T[0, 1] * ys[i] + T[0, 2] * zs[i] + T[0, 3]
         y = T[1, 0] * xs[i] + T[1, 1] * ys[i] + T[1, 2] * zs[i] + T[1, 3]
         z = T[2, 0] * xs[i] + T[2, 1] * ys[i] + T[2, 2] * zs[i] + T[2, 3]
-        if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
+        if not np.isfinite(x + y + z):
             continue
-        tx, ty = np.floor(x / tile_m), np.floor(y / tile_m)
+        tx, ty, vz = np.floor(x / tile_m), np.floor(y / tile_m), np.floor(z / voxel_m)
         x, y = x - tx * tile_m, y - ty * tile_m
-        vz = np.floor(z / voxel_m)
         if abs(tx) >= _TILE_HALF or abs(ty) >= _TILE_HALF or abs(vz) >= _HEIGHT_HALF:
             return -1
         # Rounding of the quotient may touch the upper border, which belongs to the tile's last voxel.
-        vx: Any = min(max(np.int64(x / voxel_m), 0), side - 1)
-        vy: Any = min(max(np.int64(y / voxel_m), 0), side - 1)
+        vx: Any = min(np.int64(x / voxel_m), side - 1)
+        vy: Any = min(np.int64(y / voxel_m), side - 1)
         tile = ((np.int64(tx) + _TILE_HALF) << _TILE_BITS) | (np.int64(ty) + _TILE_HALF)
         inner = (((vx << _SIDE_BITS) | vy) << _HEIGHT_BITS) | (np.int64(vz) + _HEIGHT_HALF)
-        key = (tile << _TILE_SHIFT) | inner
-        if key != last_key:
-            at = _hash(key, mask)
-            while table[at, 0] != key and table[at, 0] != _EMPTY:
-                at = (at + 1) & mask
-            if table[at, 0] == _EMPTY:
-                table[at, 0], table[at, 1], keys[used] = key, used, key
-                used += 1
-            last_key, record = key, table[at, 1]
-        records[record, 0] += np.rint(x / STEP_M)
-        records[record, 1] += np.rint(y / STEP_M)
-        records[record, 2] += np.rint(z / STEP_M)
-        if np.isfinite(intensity[i]):
-            records[record, 3] += np.rint(intensity[i] / INTENSITY_STEP)
-        records[record, 4] += 1.0
-        if classes[i] == ground_class:
-            records[record, 5] += 1.0
-        if records[record, 7] != scan:
-            records[record, 6] += 1.0
-            records[record, 7] = scan
+        keys[kept] = (tile << _TILE_SHIFT) | inner
+        steps[kept, 0] = np.rint(x / STEP_M)
+        steps[kept, 1] = np.rint(y / STEP_M)
+        steps[kept, 2] = np.rint(z / STEP_M)
+        steps[kept, 3] = np.rint(intensity[i] / INTENSITY_STEP) if np.isfinite(intensity[i]) else 0.0
+        steps[kept, 4] = 1.0 if classes[i] == ground_class else 0.0
+        kept += 1
+    return kept
+
+
+@kernel
+def _find(
+    wanted: NDArray[np.int64],
+    rows: NDArray[np.int32],
+    table: NDArray[np.int64],
+    keys: NDArray[np.int64],
+    used: int,
+) -> int:
+    """Number of the voxel of each point, new voxels included; returns the number of voxels.
+
+    A loop of its own, short enough for the processor to wait for many cache lines at once.
+    """
+    mask = len(table) - 1
+    for i in range(len(wanted)):
+        key = wanted[i]
+        at = _hash(key, mask)
+        while table[at, 0] != key and table[at, 0] != _EMPTY:
+            at = (at + 1) & mask
+        if table[at, 0] == _EMPTY:
+            table[at, 0], table[at, 1], keys[used] = key, used, key
+            used += 1
+        rows[i] = table[at, 1]
     return used
+
+
+@kernel
+def _add(
+    rows: NDArray[np.int32], steps: NDArray[np.float32], records: NDArray[np.float64], scan: int
+) -> None:
+    """Add each point to its voxel."""
+    for i in range(len(rows)):
+        record = records[rows[i]]
+        record[_X] += steps[i, 0]
+        record[_Y] += steps[i, 1]
+        record[_Z] += steps[i, 2]
+        record[_INTENSITY] += steps[i, 3]
+        record[_COUNT] += 1.0
+        record[_GROUND] += steps[i, 4]
+        if record[_LAST] != scan:
+            record[_SCANS] += 1.0
+            record[_LAST] = scan
