@@ -26,8 +26,10 @@ HIGHEST_GROUND_M = -0.15
 """The ground under the sensor is at least this far below it."""
 STEEPEST = 0.2
 FLAT_M = 0.25
-REACH_M = 12.0
-"""Farthest from a cell with ground that its slope is continued."""
+REACH_M = 8.0
+"""Farthest beyond the last cell with ground that it is continued."""
+STRANGE_M = 0.4
+"""A cell of ground this much above most of those around it is something else; twice that beyond 50 m."""
 FIT_GATES_M = (0.5, 0.3, 0.2, 0.15)
 
 
@@ -46,7 +48,8 @@ def ground_mask(x_m: F4, y_m: F4, z_m: F4, usable: B1, R_level_lidar: F8, height
     plane = seed_plane(lowest)
     if plane is None:
         return np.zeros(len(x_m), np.bool_)
-    height, slope = _follow(lowest, highest, plane)
+    height = _without_strangers(_follow(lowest, highest, plane))
+    slope = _fill(height, plane[0])
     return _near(x_m, y_m, z_m, usable, R_level_lidar, height, slope, height_m)
 
 
@@ -140,19 +143,16 @@ def _extent(x: F4, y: F4, z: F4, usable: B1, R: F8) -> tuple[F8, F8]:
 
 
 @kernel
-def _follow(lowest: F8, highest: F8, plane: F8) -> tuple[F8, F8]:
-    """Height (SECTORS, BINS), m, of the ground at each cell's middle and its slope outwards; NaN where unknown."""
+def _follow(lowest: F8, highest: F8, plane: F8) -> F8:
+    """Height (SECTORS, BINS), m, of the ground in the cells whose lowest point continues it; NaN in the others."""
     height = np.full((SECTORS, BINS), np.nan)
-    slope = np.zeros((SECTORS, BINS))
     for s in range(SECTORS):
         ux, uy = _direction(s)
         z, r, k = plane[0], 0.0, plane[1] * ux + plane[2] * uy
-        previous = -1
         for b in range(BINS):
             if not np.isfinite(lowest[s, b]):
                 continue
-            at = _center(b)
-            step = at - r
+            step = _center(b) - r
             rise = lowest[s, b] - (z + k * step)
             reach = min(step, 4.0)
             flat = highest[s, b] - lowest[s, b] < FLAT_M
@@ -160,29 +160,54 @@ def _follow(lowest: F8, highest: F8, plane: F8) -> tuple[F8, F8]:
             if rise > above or rise < -0.25 - 0.1 * reach:
                 continue
             k = min(max(k + rise / (step + 4.0), -STEEPEST), STEEPEST)
-            _bridge(height[s], slope[s], previous, b, r, z, lowest[s, b])
-            z, r, previous = lowest[s, b], at, b
-            height[s, b], slope[s, b] = z, k
-        _continue(height[s], slope[s], previous, r, z, k)
-    return height, slope
+            z, r = lowest[s, b], _center(b)
+            height[s, b] = z
+    return height
 
 
 @kernel
-def _bridge(height: F8, slope: F8, previous: int, b: int, r: float, z: float, z_next: float) -> None:
-    """The line between two cells with ground, for those between them."""
-    k = (z_next - z) / (_center(b) - r)
-    for m in range(previous + 1, b):
-        height[m] = z + k * (_center(m) - r)
-        slope[m] = k
+def _without_strangers(height: F8) -> F8:
+    """The same without cells that lie higher than most cells with ground around them."""
+    out = height.copy()
+    for s in range(SECTORS):
+        for b in range(BINS):
+            if not np.isfinite(height[s, b]):
+                continue
+            limit = height[s, b] - STRANGE_M - (0.0 if b < 70 else STRANGE_M)
+            around, lower = 0, 0
+            for ds in range(-2, 3):
+                for db in range(-2, 3):
+                    other = height[(s + ds) % SECTORS, min(max(b + db, 0), BINS - 1)]
+                    if np.isfinite(other):
+                        around += 1
+                        lower += other < limit
+            if 2 * lower > around or (around < 3 and b >= 40):
+                out[s, b] = np.nan
+    return out
 
 
 @kernel
-def _continue(height: F8, slope: F8, previous: int, r: float, z: float, k: float) -> None:
-    for m in range(previous + 1, BINS):
-        if _center(m) > r + REACH_M:
-            break
-        height[m] = z + k * (_center(m) - r)
-        slope[m] = k
+def _fill(height: F8, at_sensor: float) -> F8:
+    """Bridges cells without ground, in place, and continues it for a while; returns the slopes outwards."""
+    slope = np.zeros((SECTORS, BINS))
+    for s in range(SECTORS):
+        z, r, k, previous = at_sensor, 0.0, 0.0, -1
+        for b in range(BINS):
+            if not np.isfinite(height[s, b]):
+                continue
+            k = (height[s, b] - z) / (_center(b) - r)
+            for m in range(previous + 1, b):
+                height[s, m] = z + k * (_center(m) - r)
+            z, r, previous = height[s, b], _center(b), b
+        k = min(max((z - at_sensor) / max(r, 1.0), -STEEPEST), STEEPEST)
+        for m in range(previous + 1, BINS):
+            if _center(m) > r + REACH_M:
+                break
+            height[s, m] = z + k * (_center(m) - r)
+        for b in range(1, BINS - 1):
+            k = (height[s, b + 1] - height[s, b - 1]) / (_center(b + 1) - _center(b - 1))
+            slope[s, b] = min(max(k, -STEEPEST), STEEPEST) if np.isfinite(k) else 0.0
+    return slope
 
 
 @kernel
