@@ -112,13 +112,14 @@ def _solve_plain(nodes: F8, factors: Sequence[Factor]) -> Solution:
 
 def _switch_off(factors: Sequence[Factor], T: F8, probability: float) -> bool:
     """Chi-square test of the doubted factors at the solution; true when one fails."""
-    from scipy.stats import chi2
+    from scipy.special import gammaincinv
 
+    limits = {kind: 2.0 * float(gammaincinv(n / 2.0, probability)) for kind, n in DEGREES_OF_FREEDOM.items()}
     norms = whitened_norms(factors, T)
     failed = False
     for factor, norm in zip(factors, norms, strict=True):
         if factor.doubted and not factor.verdict:
-            limit = chi2.ppf(probability, DEGREES_OF_FREEDOM[factor.kind])
+            limit = limits[factor.kind]
             if norm**2 > limit:
                 factor.weight, factor.verdict = (
                     0.0,

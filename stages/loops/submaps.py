@@ -45,6 +45,8 @@ class Submap:
     T_lidar_level: F8
     ground_z_m: float
     """Height of the ground under the LiDAR; NaN when no ground is labelled."""
+    scan: F8
+    """Points (k, 3) of the keyframe's own scan, for tests of what it saw through."""
 
 
 class SubmapShelf:
@@ -69,7 +71,7 @@ class SubmapShelf:
             ground.append(is_ground)
         merged, flags = np.concatenate(points), np.concatenate(ground)
         kept = downsample(merged, self._settings.voxel_size_m)
-        return _levelled(merged[kept], flags[kept])
+        return _levelled(merged[kept], flags[kept], self._cloud(track, keyframe)[0])
 
     def _members(self, t: Track, keyframe: int) -> list[int]:
         """The keyframe itself and others every `step_m` on both sides."""
@@ -102,16 +104,16 @@ class SubmapShelf:
         return cloud
 
 
-def _levelled(points: F8, ground: NDArray[np.bool_]) -> Submap:
+def _levelled(points: F8, ground: NDArray[np.bool_], scan: F8) -> Submap:
     near = points[ground & (np.hypot(points[:, 0], points[:, 1]) < LEVEL_RADIUS_M)]
     if len(near) < 50:
-        return Submap(points, ground, np.eye(4), float("nan"))
+        return Submap(points, ground, np.eye(4), float("nan"), scan)
     plane = _ground_plane(near)
     normal = np.array([-plane[0], -plane[1], 1.0]) / np.sqrt(1 + plane[0] ** 2 + plane[1] ** 2)
     x = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
     x /= np.linalg.norm(x)
     R = np.column_stack((x, np.cross(normal, x), normal))
-    return Submap(points @ R, ground, pose(R, np.zeros(3)), float(plane[2] * normal[2]))
+    return Submap(points @ R, ground, pose(R, np.zeros(3)), float(plane[2] * normal[2]), scan @ R)
 
 
 def _ground_plane(points: F8) -> F8:

@@ -21,6 +21,7 @@ from scanloom.stages.geometry.voxel_map import STEPS, nearest
 from scanloom.stages.geometry.voxels import downsample, voxel_keys
 from scanloom.stages.loops.candidates import Candidate
 from scanloom.stages.loops.coarse import Hypothesis, hypotheses
+from scanloom.stages.loops.freespace import seen_through
 from scanloom.stages.loops.submaps import Submap
 
 
@@ -58,6 +59,12 @@ class VerificationSettings(BaseModel):
     )
     min_contrast: float = Field(
         default=0.2, ge=0, le=1, description="a copy displaced by 1.5 m must lose this share of inliers"
+    )
+    max_seen_through: float = Field(
+        default=0.04,
+        ge=0,
+        le=1,
+        description="share of upright structure of one pass that the other looked through",
     )
     max_disagreement_m: float = Field(
         default=0.25, gt=0, le=5, description="forward against backward registration, m"
@@ -181,6 +188,7 @@ def _judge(
     )
     reason = reason or _implausible(settings, c, path_m, T_i_j)
     reason = reason or _indistinct(settings, maps, points[~ground], T)
+    reason = reason or _transparent(settings, i, j, T)
     reason = reason or _one_sided(settings, i, j, T)
     return Verdict(T_i_j, _covariance(settings, r, j), float(inlier.mean()), r.rmse_m, overlap, reason)
 
@@ -216,6 +224,20 @@ def _indistinct(settings: VerificationSettings, maps: _Maps, upright: F8, T: F8)
         if here - there < settings.min_contrast * here:
             return f"not distinct: a copy displaced by 1.5 m fits {there:.0%} instead of {here:.0%}"
     return ""
+
+
+def _transparent(settings: VerificationSettings, i: Submap, j: Submap, T: F8) -> str:
+    """Upright structure of one pass that the other one's scan looked through."""
+    of_i = transform(inverse(T), _upright(i))
+    conflict = max(seen_through(j.scan, of_i), seen_through(i.scan, transform(T, _upright(j))))
+    if conflict > settings.max_seen_through:
+        return f"{conflict:.0%} of the structure of one pass was seen through on the other"
+    return ""
+
+
+def _upright(submap: Submap) -> F8:
+    z = submap.ground_z_m if np.isfinite(submap.ground_z_m) else -np.inf
+    return submap.points[~submap.ground & (submap.points[:, 2] > z + 0.5)]
 
 
 def _one_sided(settings: VerificationSettings, i: Submap, j: Submap, T: F8) -> str:

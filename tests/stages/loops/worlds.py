@@ -71,20 +71,21 @@ def polyline(corners: list[tuple[float, float]], step_m: float = 1.0, z: float =
 
 
 def scans_of(
-    world: BoxWorld,
-    T: np.ndarray,
-    seed: int = 0,
-    rows: int = 24,
-    columns: int = 360,
-    start_ns: int = START_NS,
-) -> list[DeskewedScan]:
+    world: BoxWorld, T: np.ndarray, seed: int = 0, rows: int = 16, columns: int = 300, start_ns: int = START_NS,
+    first_index: int = 0,
+) -> list[DeskewedScan]:  # fmt: skip
+    """One scan per pose, two a second; only boxes within 60 m are asked."""
     rng = np.random.default_rng(seed)
-    return [
-        observe(
-            world, T[k], index=k, stamp_ns=start_ns + k * 500_000_000, rng=rng, rows=rows, columns=columns
+    out = []
+    for k, pose_k in enumerate(T):
+        at = pose_k[:3, 3]
+        gap = np.maximum(np.maximum(world.boxes[:, 0] - at, at - world.boxes[:, 1]), 0)
+        near = BoxWorld(world.boxes[np.linalg.norm(gap, axis=1) < 60])
+        stamp = start_ns + k * 500_000_000
+        out.append(
+            observe(near, pose_k, index=first_index + k, stamp_ns=stamp, rng=rng, rows=rows, columns=columns)
         )
-        for k in range(len(T))
-    ]
+    return out
 
 
 def labels_of(
