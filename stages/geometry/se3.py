@@ -143,7 +143,8 @@ def matrix_from_quaternion(q: ArrayLike) -> F8:
     u = u / np.linalg.norm(u, axis=-1, keepdims=True)
     w, v = u[..., 0], u[..., 1:]
     K = hat(v)
-    return np.eye(3) + 2 * w[..., None, None] * K + 2 * (K @ K)
+    R: F8 = np.eye(3) + 2 * w[..., None, None] * K + 2 * (K @ K)
+    return R
 
 
 def yaw_of(T: ArrayLike) -> F8:

@@ -126,7 +126,7 @@ def _unpack_columns(body: bytes, dtype: np.dtype[Any], points: int) -> NDArray[A
 @kernel
 def _lzf(packed: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
     """LZF: a byte below 32 starts that many plus one literals, else a copy from earlier output. -1 when damaged."""
-    i, o = 0, 0
+    i, o, count = np.int64(0), np.int64(0), np.int64(0)
     while i < len(packed):
         control = np.int64(packed[i])
         i += 1
@@ -154,4 +154,4 @@ def _lzf(packed: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
             for k in range(count):
                 out[o + k] = out[source + k]
         o += count
-    return o
+    return int(o)

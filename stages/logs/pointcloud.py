@@ -217,7 +217,8 @@ def _rings(
     else:
         return np.zeros(len(table), np.uint16), ""
     sample = slice(None, None, max(1, len(table) // 2000))
-    trend = elevation_trend(*(axis[sample] for axis in xyz), ring[sample].astype(np.int64))
+    x, y, z = (axis[sample] for axis in xyz)
+    trend = elevation_trend(x, y, z, ring[sample].astype(np.int64))
     if not name and abs(trend) < 0.8:
         return np.zeros(len(table), np.uint16), ""
     if trend > -0.8:
