@@ -1,0 +1,79 @@
+"""The list of tiles and the whole map."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+
+from scanloom.schemas.errors import StageError
+from scanloom.schemas.product import Parts
+from scanloom.schemas.tiles import Tile
+from scanloom.stages.tiling import overview, ply
+from scanloom.stages.tiling.overview import Settings, checksum
+from tests.stages.mapping import Source, pieces_of, tile_parts, tiles_of
+from tests.worlds import drive, street
+
+
+@pytest.fixture(scope="module")
+def tiles() -> Parts[Tile]:
+    return tile_parts(tiles_of([Source("a", "0000", pieces_of(*drive(street(), 4, step_m=10.0)))]))
+
+
+def read_ply(data: bytes) -> np.ndarray:
+    head, body = data.split(b"end_header\n", 1)
+    count = int(head.split(b"element vertex ")[1].split()[0])
+    vertices = np.frombuffer(body, ply.VERTEX)
+    assert len(vertices) == count
+    return vertices
+
+
+def test_index_lists_every_tile_with_its_bounds(tiles: Parts[Tile]) -> None:
+    index, _ = overview(Settings(), tiles)
+    assert len(index) == len(tiles)
+    assert index.points.sum() == sum(len(tile) for tile in tiles)
+    by_name = {c["tile"]: tile for c, tile in tiles.items()}
+    positions = [tuple(int(v) for v in name.split("_")) for name in index.tile]
+    assert positions == sorted(positions)
+    for name, low, high, digest in zip(index.tile, index.min_m, index.max_m, index.checksum):
+        tile = by_name[name]
+        assert np.allclose(low, [tile.x_m.min(), tile.y_m.min(), tile.z_m.min()] + np.array(tile.offset_m))
+        assert (low <= high).all()
+        assert digest == checksum(tile)
+    assert (index.tile_size_m, index.voxel_size_m) == (50.0, 0.1)
+
+
+def test_checksum_changes_with_one_bit(tiles: Parts[Tile]) -> None:
+    tile = tiles[0]
+    changed = tile.intensity.copy()
+    changed[0] = np.nextafter(changed[0], np.float32(2))
+    assert checksum(tile.take(slice(None))) == checksum(tile)
+    assert checksum(type(tile)(**{**vars(tile), "intensity": changed})) != checksum(tile)
+
+
+def test_the_map_is_the_thinned_union_of_the_tiles(tiles: Parts[Tile]) -> None:
+    _, files = overview(Settings(map_voxel_size_m=0.5), tiles)
+    points = read_ply(files.read("map.ply"))
+    everything = np.concatenate(
+        [np.column_stack((t.x_m, t.y_m, t.z_m)).astype(float) + t.offset_m for t in tiles]
+    )
+    xyz = np.column_stack((points["x"], points["y"], points["z"]))
+    voxels = np.unique(np.floor(everything / 0.5).astype(int), axis=0)
+    assert 0.99 * len(voxels) <= len(xyz) <= 1.01 * len(voxels)
+    assert np.abs(xyz.min(axis=0) - everything.min(axis=0)).max() < 0.5
+    assert np.abs(xyz.max(axis=0) - everything.max(axis=0)).max() < 0.5
+
+
+def test_a_map_as_fine_as_its_tiles_keeps_every_point(tiles: Parts[Tile]) -> None:
+    _, files = overview(Settings(map_voxel_size_m=0.1), tiles)
+    buffer = io.BytesIO()
+    files.contents["map.ply"](buffer)  # type: ignore[operator]
+    assert len(read_ply(buffer.getvalue())) == sum(len(tile) for tile in tiles)
+    assert files.read("map.ply") == buffer.getvalue()
+
+
+def test_no_tiles_is_an_error_with_advice() -> None:
+    with pytest.raises(StageError, match="no tiles") as caught:
+        overview(Settings(), Parts([]))
+    assert "tiling.classes" in str(caught.value)
