@@ -22,6 +22,9 @@ __all__ = ["Registration", "VoxelMap", "align"]
 ROTATION_STEP_RAD = 2e-5
 TRANSLATION_STEP_M = 5e-4
 INNER_STEPS = 3
+SETTLING = 8
+SETTLED = 10.0
+"""Partners may swap to and fro for ever: after this many searches, steps this many times larger count as none."""
 MIN_MATCHES = 20
 
 
@@ -95,7 +98,8 @@ def align(
             T = T @ se3_exp(step)
             if _small(step):
                 break
-        converged = residual.matches >= MIN_MATCHES and _close(start, T)
+        tolerance = 1.0 if iterations <= SETTLING else SETTLED
+        converged = residual.matches >= MIN_MATCHES and _close(start, T, tolerance)
     H, _, residual = partner.linearise(points, T, scale_m)
     return _result(T, H, residual, partner, points, converged, iterations)
 
@@ -144,12 +148,11 @@ def _small(step: F8) -> bool:
     )
 
 
-def _close(a: F8, b: F8) -> bool:
+def _close(a: F8, b: F8, tolerance: float) -> bool:
     turn = a[:3, :3].T @ b[:3, :3]
     w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    return bool(
-        np.linalg.norm(w) < ROTATION_STEP_RAD and np.linalg.norm(a[:3, 3] - b[:3, 3]) < TRANSLATION_STEP_M
-    )
+    way = np.linalg.norm(a[:3, 3] - b[:3, 3])
+    return bool(np.linalg.norm(w) < tolerance * ROTATION_STEP_RAD and way < tolerance * TRANSLATION_STEP_M)
 
 
 def _result(

@@ -9,7 +9,7 @@ from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.geometry.voxels import Int
 
 JACOBI_SWEEPS = 12
-_OFF_DIAGONAL = 1e-14
+_OFF_DIAGONAL = 1e-20
 
 
 @kernel

@@ -50,7 +50,7 @@ class Settings(BaseModel):
         0.2, ge=0.01, le=3.2, description="largest plausible correction of rotation, rad"
     )
     least_p: float = Field(
-        0.5,
+        0.9,
         ge=0.0,
         le=1.0,
         description="directions observed with less probability are taken from the prediction",
@@ -59,5 +59,5 @@ class Settings(BaseModel):
     covariance_inflation: float = Field(
         4.0, ge=0.1, le=1000.0, description="factor on sigma^2 / lambda: residuals share the map's errors"
     )
-    floor_m: float = Field(0.005, ge=0.0, le=1.0, description="least standard deviation of translation, m")
-    floor_rad: float = Field(0.0003, ge=0.0, le=0.1, description="least standard deviation of rotation, rad")
+    floor_m: float = Field(0.002, ge=0.0, le=1.0, description="least standard deviation of translation, m")
+    floor_rad: float = Field(0.0001, ge=0.0, le=0.1, description="least standard deviation of rotation, rad")
