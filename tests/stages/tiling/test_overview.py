@@ -38,7 +38,7 @@ def test_index_lists_every_tile_with_its_bounds(tiles: Parts[Tile]) -> None:
     assert positions == sorted(positions)
     for name, low, high, digest in zip(index.tile, index.min_m, index.max_m, index.checksum):
         tile = by_name[name]
-        assert np.allclose(low, [tile.x_m.min(), tile.y_m.min(), tile.z_m.min()] + np.array(tile.offset_m))
+        assert np.allclose(low, np.array([tile.x_m.min(), tile.y_m.min(), tile.z_m.min()]) + tile.offset_m)
         assert (low <= high).all()
         assert digest == checksum(tile)
     assert (index.tile_size_m, index.voxel_size_m) == (50.0, 0.1)
