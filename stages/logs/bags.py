@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from scanloom.schemas.errors import InvalidInput
@@ -32,9 +33,6 @@ class BagLog:
     files: list[Container]
     problems: tuple[Problem, ...] = ()
     extrinsics: tuple[Extrinsic, ...] = ()
-    expected_messages: int = 0
-    """Messages that the log's own metadata promises; 0 when it does not tell."""
-    missing_files: tuple[str, ...] = ()
     topics: tuple[TopicInfo, ...] = ()
     opening: Damage = field(default_factory=Damage)
 
@@ -147,6 +145,7 @@ def open_bags(raw_log: RawLog, format: str) -> BagLog:
             errors.append(error)
             opening.texts.append(f"{name} cannot be opened: {error.what}")
             opening.lost_bytes += raw_log.path(name).stat().st_size
+    opening.texts += _missing_parts(raw_log, files)
     if not files:
         raise errors[0] if errors else InvalidInput("The folder holds no bag file.", where=str(raw_log.root))
     return BagLog(format, files, opening=opening)
@@ -165,3 +164,27 @@ _OPENERS: dict[str, Callable[[Path], Container]] = {
     ".active": Rosbag1File,
     ".db3": DatabaseFile,
 }
+
+
+def _missing_parts(raw_log: RawLog, files: Sequence[Container]) -> Iterator[str]:
+    """What a rosbag2 folder's metadata promises and the folder does not hold."""
+    name = next((name for name in raw_log.names if Path(name).name == "metadata.yaml"), "")
+    if not name:
+        return
+    try:
+        content = yaml.safe_load(raw_log.path(name).read_text(encoding="utf-8"))
+        about = content["rosbag2_bagfile_information"]
+        parts = [Path(str(part)).name for part in about["relative_file_paths"]]
+        promised = int(about["message_count"])
+        span_s = int(about["duration"]["nanoseconds"]) / 1e9
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, ValueError):
+        yield "metadata.yaml cannot be read; the bag files themselves are used"
+        return
+    held = {Path(name).name for name in raw_log.names}
+    missing = [part for part in parts if part not in held and part.removesuffix(".zstd") not in held]
+    if missing:
+        yield f"{len(missing)} of {len(parts)} files of the bag are missing ({', '.join(missing[:3])})"
+    found = sum(len(stamps) for file in files for stamps in file.stamps.values())
+    if found < promised:
+        share = 1 - found / promised
+        yield f"{promised - found} of {promised} messages are missing (about {share * span_s:.1f} of {span_s:.1f} s)"

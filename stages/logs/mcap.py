@@ -7,6 +7,7 @@ times), unless a channel is declared only inside. Source: mcap.dev/spec, version
 
 from __future__ import annotations
 
+import mmap
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,7 +27,8 @@ from scanloom.stages.logs.containers import (
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = range(1, 8)
-DATA_END = 0x0F
+CHUNK_INDEX, DATA_END = 0x08, 0x0F
+_FOOTER_SIZE = 9 + 20
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 
@@ -54,29 +56,30 @@ class McapFile(ChunkedFile):
         while at + _HEAD.size <= size and not ended:
             op, length = _HEAD.unpack_from(self._bytes, at)
             begin, end = at + _HEAD.size, at + _HEAD.size + length
-            if end > size:
-                self._cut(op, at, begin)
-                break
-            if op == MESSAGE and length >= _MESSAGE.size:
-                channel, _, log_ns, _ = _MESSAGE.unpack_from(self._bytes, begin)
-                run.add(channel, log_ns, at, end)
-            elif not self._note(op, begin, end, at):
-                break
+            if end > size or not self._note(op, begin, end, at, run):
+                resumed = self._resume(at)
+                if resumed is None:
+                    self._cut(op, at, begin)
+                    break
+                self._lose(f"{(resumed - at) / 1e6:.2g} MB at {at / 1e6:.1f} MB are damaged", resumed - at)
+                end = resumed
             if op != MESSAGE or run.full:
                 self._blocks += run.take()
-            at = end
-            ended = op == DATA_END
+            at, ended = end, op == DATA_END
         self._blocks += run.take()
         if not ended and not self.damage:
             self.damage.texts.append(
                 "the end of the file is missing: it was cut, or its recording was not closed"
             )
 
-    def _note(self, op: int, begin: int, end: int, at: int) -> bool:
-        """One whole record; False when it makes no sense and walking must stop."""
+    def _note(self, op: int, begin: int, end: int, at: int, run: LooseRun) -> bool:
+        """One whole record; False when it makes no sense."""
         body = self._bytes[begin:end]
         try:
-            if op == HEADER:
+            if op == MESSAGE:
+                channel, _, log_ns, _ = _MESSAGE.unpack_from(body, 0)
+                run.add(channel, log_ns, at, end)
+            elif op == HEADER:
                 self.profile = _text(body, 0)[0]
             elif op == SCHEMA:
                 self._schema(body)
@@ -86,16 +89,56 @@ class McapFile(ChunkedFile):
                 self._blocks.append(_chunk(body, begin))
             elif op == MESSAGE_INDEX:
                 self._message_index(body)
-            elif op == 0 or (op > DATA_END and op < 0x80):
+            elif op == 0 or (DATA_END < op < 0x80):
                 raise DamageError("a record of unknown kind")
-        except (DamageError, struct.error, ValueError) as error:
-            self._lose(f"the file is damaged at {at / 1e6:.1f} MB ({error})", len(self._bytes) - at)
+        except (DamageError, struct.error, ValueError):
             return False
         return True
 
+    def _resume(self, at: int) -> int | None:
+        """Where the next whole chunk begins after the damage at `at`: as the summary says, else by its looks."""
+        starts = [offset for offset in self._summary() if offset > at]
+        if starts:
+            return min(starts)
+        for mark in (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4"):
+            found = _find(self._bytes, mark, at + _HEAD.size + 29)
+            while found >= 0:
+                start = found - 28 - _HEAD.size
+                op, length = _HEAD.unpack_from(self._bytes, start)
+                if op == CHUNK and start + _HEAD.size + length <= len(self._bytes):
+                    return start
+                found = _find(self._bytes, mark, found + 1)
+        return None
+
+    def _summary(self) -> list[int]:
+        """Starts of all chunks by the summary at the end, whose schemas and channels are taken in; empty without one."""
+        size = len(self._bytes)
+        foot = size - len(MAGIC) - _FOOTER_SIZE
+        if (
+            foot < len(MAGIC)
+            or bytes(self._bytes[size - len(MAGIC) :]) != MAGIC
+            or self._bytes[foot] != FOOTER
+        ):
+            return []
+        (at,) = struct.unpack_from("<Q", self._bytes, foot + _HEAD.size)
+        starts: list[int] = []
+        while 0 < at <= foot - _HEAD.size:
+            op, length = _HEAD.unpack_from(self._bytes, at)
+            body = self._bytes[at + _HEAD.size : at + _HEAD.size + length]
+            try:
+                if op == SCHEMA:
+                    self._schema(body)
+                elif op == CHANNEL:
+                    self._channel(body)
+                elif op == CHUNK_INDEX:
+                    starts.append(struct.unpack_from("<Q", body, 16)[0])
+            except (DamageError, struct.error, ValueError):
+                return starts
+            at += _HEAD.size + length
+        return starts
+
     def _cut(self, op: int, at: int, begin: int) -> None:
-        """The last record is incomplete."""
-        lost = len(self._bytes) - at
+        """Nothing whole follows; of a chunk that is cut the beginning can still be read."""
         if op == CHUNK:
             try:
                 block = _chunk(self._bytes[begin:], begin)
@@ -103,11 +146,17 @@ class McapFile(ChunkedFile):
                 self._blocks.append(block)
             except (DamageError, struct.error, ValueError):
                 pass
+        lost = len(self._bytes) - at
         self._lose(
-            f"the file ends in the middle of a record, at {len(self._bytes) / 1e6:.1f} MB: it was cut, "
-            "and what was recorded after that is missing",
+            f"the file ends in the middle of a record, {lost / 1e6:.2g} MB after the last whole one: it was cut at "
+            f"{len(self._bytes) / 1e6:.1f} MB, and what was recorded after that is missing",
             lost,
         )
+
+    def _index_unindexed(self) -> None:
+        super()._index_unindexed()
+        if any(channel not in self.channels for block in self._blocks for channel in block.stamps):
+            self._summary()
 
     def _schema(self, body: memoryview) -> None:
         (number,) = struct.unpack_from("<H", body, 0)
@@ -145,6 +194,12 @@ class McapFile(ChunkedFile):
                 self._schema(data[begin:at])
             elif channels is None and op == CHANNEL:
                 self._channel(data[begin:at])
+
+
+def _find(data: memoryview, mark: bytes, start: int) -> int:
+    source = data.obj
+    found: int = source.find(mark, start) if isinstance(source, mmap.mmap) else bytes(data).find(mark, start)
+    return found
 
 
 def _chunk(body: memoryview, begin: int) -> Block:

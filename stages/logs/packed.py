@@ -32,7 +32,8 @@ class PackedFile:
         try:
             self._inner = inner(plain)
         except InvalidInput as error:
-            raise InvalidInput(error.what, where=str(path), next_step=error.next_step) from error
+            what = f"The compressed file is damaged or was cut too early ({cut})." if cut else error.what
+            raise InvalidInput(what, where=str(path), next_step=error.next_step) from error
 
     @property
     def channels(self) -> dict[int, Channel]:
@@ -73,6 +74,8 @@ def _unpack(source: Path, target: Path) -> str:
                 plain.write(piece)
         except zstandard.ZstdError as error:
             return str(error)
+    if not written:
+        return "it ends before its first block does"
     return "" if _complete(source, written) else "it is shorter than it says"
 
 

@@ -166,6 +166,12 @@ def no_lidar(source: LogSource, where: str) -> InvalidInput:
     if packets:
         found.insert(0, f"raw packets of a LiDAR driver ({packets[0]}), which are not decoded")
     holds = _sentence(found) if found else f"{len(source.topics)} topics, none of a kind that is known"
+    if source.damage:
+        return InvalidInput(
+            f"The log is damaged, and what can be read of it has no point cloud: {'; '.join(source.damage.texts[:3])}.",
+            where=where,
+            next_step="copy the log again from where it was recorded, or give another one",
+        )
     return InvalidInput(
         f"The log has no 3D LiDAR topic (sensor_msgs/PointCloud2 or livox CustomMsg). It holds {holds}.",
         where=where,

@@ -6,6 +6,7 @@ any other. Source: ROS wiki, "Bags/Format/2.0".
 
 from __future__ import annotations
 
+import mmap
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,6 +27,8 @@ from scanloom.stages.logs.containers import (
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 _MAX_HEADER = 1 << 20
+_CUT = "the file ends in the middle of a record"
+_CHUNK_MARK = b"\x04\0\0\0op=\x05"
 
 
 class Rosbag1File(ChunkedFile):
@@ -53,18 +56,16 @@ class Rosbag1File(ChunkedFile):
         run = LooseRun()
         while at < size:
             try:
-                fields, begin, end = self._head(at, size)
-                op = _op(fields)
-                if end > size:
-                    self._cut(op, fields, begin, size)
-                    break
-                if op == MESSAGE:
-                    run.add(_connection_number(fields), _time_ns(fields), at, end)
-                else:
-                    self._note(op, fields, begin, end)
+                op, end = self._note_next(at, size, run)
             except (DamageError, struct.error, ValueError, KeyError) as error:
-                self._stop(at, str(error))
-                break
+                resumed = self._resume(at)
+                if resumed is None:
+                    self._stop(at, str(error))
+                    break
+                self._lose(
+                    f"{(resumed - at) / 1e6:.2g} MB at {at / 1e6:.1f} MB are damaged ({error})", resumed - at
+                )
+                op, end = CHUNK, resumed
             if op != MESSAGE or run.full:
                 self._blocks += run.take()
             at = end
@@ -73,8 +74,44 @@ class Rosbag1File(ChunkedFile):
             self.damage.texts.append(
                 "the recording was not closed properly"
                 if self._index_at == 0
-                else "the end of the file is missing"
+                else self._missing("the end of the file")
             )
+
+    def _note_next(self, at: int, size: int, run: LooseRun) -> tuple[int, int]:
+        """Take in the record at `at`; its kind and where it ends."""
+        fields, begin, end = self._head(at, size)
+        op = _op(fields)
+        if end > size:
+            if op == CHUNK and self._resume(at) is None:
+                self._cut(fields, begin, size)
+            raise DamageError(_CUT)
+        if op == MESSAGE:
+            run.add(_connection_number(fields), _time_ns(fields), at, end)
+        else:
+            self._note(op, fields, begin, end)
+        return op, end
+
+    def _resume(self, at: int) -> int | None:
+        """Where the next whole chunk begins after the damage at `at`."""
+        source = self._bytes.obj
+        if not isinstance(source, mmap.mmap):
+            return None
+        found = source.find(_CHUNK_MARK, at + 1)
+        while found >= 0:
+            # the mark stands among the fields of a header whose length precedes it, 13 to 60 bytes before
+            for start in range(found - 4, max(found - 64, at), -1):
+                (length,) = struct.unpack_from("<I", source, start)
+                if 8 <= found - start + 4 <= length + 4 <= 120 and self._is_chunk(start):
+                    return start
+            found = source.find(_CHUNK_MARK, found + 1)
+        return None
+
+    def _is_chunk(self, start: int) -> bool:
+        try:
+            fields, _, end = self._head(start, len(self._bytes))
+            return _op(fields) == CHUNK and b"size" in fields and end <= len(self._bytes)
+        except (DamageError, struct.error):
+            return False
 
     def _head(self, at: int, size: int) -> tuple[dict[bytes, memoryview], int, int]:
         """Fields of the record at `at`, begin and end of its data (the end may lie beyond the file)."""
@@ -83,7 +120,7 @@ class Rosbag1File(ChunkedFile):
             raise DamageError("a record's header is longer than it can be")
         fields_end = at + 4 + length
         if fields_end + 4 > size:
-            raise DamageError("the file ends in the middle of a record")
+            raise DamageError(_CUT)
         fields = _fields(self._bytes[at + 4 : fields_end])
         (data,) = struct.unpack_from("<I", self._bytes, fields_end)
         return fields, fields_end + 4, fields_end + 4 + data
@@ -117,27 +154,30 @@ class Rosbag1File(ChunkedFile):
             topic.decode("utf-8", "replace"), kind.decode("utf-8", "replace"), "ros1"
         )
 
-    def _cut(self, op: int, fields: dict[bytes, memoryview], begin: int, size: int) -> None:
-        """The last record is incomplete; of a chunk the beginning can still be read."""
-        if op == CHUNK:
-            try:
-                block = _chunk(fields, begin, size)
-                block.cut = True
-                self._blocks.append(block)
-            except (DamageError, struct.error, KeyError):
-                pass
-        self._stop(begin, "the file ends in the middle of a record")
+    def _cut(self, fields: dict[bytes, memoryview], begin: int, size: int) -> None:
+        """Of a chunk that is cut the beginning can still be read."""
+        try:
+            block = _chunk(fields, begin, size)
+            block.cut = True
+            self._blocks.append(block)
+        except (struct.error, KeyError):
+            pass
 
     def _stop(self, at: int, why: str) -> None:
+        """Nothing whole follows."""
         size = len(self._bytes)
-        cut = "ends in the middle" in why
-        self._lose(
-            f"the file ends in the middle of a record, at {size / 1e6:.1f} MB: it was cut, and what was recorded after "
-            "that is missing"
-            if cut
-            else f"the file is damaged at {at / 1e6:.1f} MB ({why})",
-            size - at,
-        )
+        lost = f"{(size - at) / 1e6:.2g} MB after the last whole one"
+        text = f"the file ends in the middle of a record, {lost}: it was cut at {size / 1e6:.1f} MB"
+        if why != _CUT:
+            text = f"the file is damaged from {at / 1e6:.1f} MB on ({why})"
+        self._lose(self._missing(text), size - at)
+
+    def _missing(self, text: str) -> str:
+        """How much of the file there was, as its header tells when the recording was closed."""
+        size = len(self._bytes)
+        if self._index_at > size:
+            return f"{text}; {100 * (1 - size / self._index_at):.0f} % of the log is missing"
+        return f"{text}, and what was recorded after that is missing" if not self._index_at else text
 
     def _records(self, data: memoryview, block: Block, channels: set[int] | None) -> Iterator[RawMessage]:
         at, size = 0, len(data)

@@ -32,6 +32,7 @@ from scanloom.stages.logs.sweeps import ScanTally
 
 I8 = NDArray[np.int64]
 _CLOCK_APART_NS = 1_000_000_000
+_MOST_SHOWN = 4
 
 
 @dataclass
@@ -184,7 +185,7 @@ class Survey:
         stamps = np.unique(self.tracks["lidar"].header_ns)
         period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
         problems = [
-            *self._damage(),
+            *self._damage(tally),
             *self.source.problems,
             *self.roles.problems,
             *tally.problems,
@@ -205,13 +206,20 @@ class Survey:
             topics=self._topics(),
             extrinsics=extrinsics,
             problems=tuple(problems),
-            complete=not self.source.damage,
+            complete=not self.source.damage and not any(track.broken for track in self.tracks.values()),
         )
 
-    def _damage(self) -> Iterator[Problem]:
+    def _damage(self, tally: ScanTally) -> Iterator[Problem]:
         damage = self.source.damage
-        for text in damage.texts:
-            yield Problem(code="log.damaged", severity="warning", text=f"The log is incomplete: {text}.")
+        if not damage:
+            return
+        shown = damage.texts[:_MOST_SHOWN]
+        more = f"; and {len(damage.texts) - len(shown)} more places" if len(damage.texts) > len(shown) else ""
+        text = (
+            f"The log is incomplete: {'; '.join(shown)}{more}. {tally.scans} scans over "
+            f"{(tally.last_ns - tally.first_ns) / 1e9:.1f} s can be read."
+        )
+        yield Problem(code="log.incomplete", severity="warning", text=text)
 
     def _sensor_problems(self, imu: Imu, gnss: Gnss, extrinsics: Sequence[Extrinsic]) -> Iterator[Problem]:
         starts = [self.tracks["lidar"].header_ns[0]] if self.tracks["lidar"].header_ns else []

@@ -29,6 +29,7 @@ _REORDER_DEPTH = 3
 _LONGEST_SWEEPS = 3.0
 """Points of one scan spread over more periods than this have times that mean something else."""
 _FEW_POINTS = 300
+_FARTHEST_M = np.float32(20_000)
 
 
 @dataclass
@@ -214,7 +215,9 @@ def _decode(message: CloudMessage) -> Cloud:
 
 
 def _returns(cloud: Cloud) -> NDArray[np.bool_]:
-    """Points that are measurements: finite, and not the zeros that drivers write where nothing came back."""
+    """Points that are measurements: not NaN, not beyond any LiDAR, not the zeros that drivers write for no return."""
     x, y, z = cloud.x_m, cloud.y_m, cloud.z_m
-    finite: NDArray[np.bool_] = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
-    return finite & ((x != 0) | (y != 0) | (z != 0))
+    near: NDArray[np.bool_] = (
+        (np.abs(x) < _FARTHEST_M) & (np.abs(y) < _FARTHEST_M) & (np.abs(z) < _FARTHEST_M)
+    )
+    return near & ((x != 0) | (y != 0) | (z != 0))
