@@ -17,7 +17,7 @@ import io
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import IO, Any, ClassVar, Generic, Self, TypeVar
 
@@ -138,6 +138,8 @@ class Table(Product):
             if name not in table.column_names:
                 raise ProductError(f"column {name} of {cls.NAME} is missing", where=where)
             arrays[name] = _from_arrow(table.column(name), spec, name, where)
+        if set(attributes) != set(attributes_of(cls)):
+            raise ProductError(f"attributes {sorted(attributes)} are not those of {cls.NAME}", where=where)
         return cls(**arrays, **attributes)
 
     def write(self, path: Path) -> int:
@@ -261,6 +263,8 @@ class Document(BaseModel, Product):
     def open(cls, path: Path) -> Self:
         try:
             body = json.loads(path.read_text())
+            if not isinstance(body, dict):
+                raise ValueError("not a JSON object")
             _check_identity(cls, body.pop("schema", ""), body.pop("version", 0), path)
             return cls.model_validate(body)
         except (OSError, ValueError, ValidationError) as error:
@@ -373,17 +377,17 @@ class Parts(Sequence[ProductT]):
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=None)
+@cache
 def columns_of(table: type[Table]) -> dict[str, Column]:
     return {f.name: f.metadata["column"] for f in dataclasses.fields(table) if "column" in f.metadata}
 
 
-@lru_cache(maxsize=None)
+@cache
 def attributes_of(table: type[Table]) -> dict[str, str]:
     return {f.name: f.metadata["attribute"] for f in dataclasses.fields(table) if "attribute" in f.metadata}
 
 
-@lru_cache(maxsize=None)
+@cache
 def arrow_schema(table: type[Table]) -> pa.Schema:
     fields = []
     for name, spec in columns_of(table).items():
@@ -449,7 +453,7 @@ def _from_arrow(chunked: pa.ChunkedArray, spec: Column, name: str, where: str) -
     return flat.reshape(-1, *spec.shape) if spec.shape else flat
 
 
-@lru_cache(maxsize=None)
+@cache
 def _writer_options(table: type[Table]) -> dict[str, Any]:
     """Encodings per leaf: byte-stream split for floats, deltas for stamps, dictionaries for strings."""
     encodings: dict[str, str] = {}
@@ -524,5 +528,5 @@ class _damage_named:
         return None
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, (OSError, ValueError, KeyError)) and not isinstance(error, ProductError):
+        if isinstance(error, (OSError, ValueError, KeyError, pa.ArrowException)) and not isinstance(error, ProductError):
             raise _damaged(self.path, error) from error

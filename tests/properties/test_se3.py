@@ -66,7 +66,9 @@ def test_exponential_is_the_rotation(w: np.ndarray) -> None:
 def test_logarithm_undoes_exponential(w: np.ndarray) -> None:
     back = so3_log(so3_exp(w))
     # At half a turn the axis may point either way.
-    either = min(np.abs(back - w).max(), np.abs(back + w).max() if np.linalg.norm(w) > np.pi - 1e-7 else np.inf)
+    either = min(
+        np.abs(back - w).max(), np.abs(back + w).max() if np.linalg.norm(w) > np.pi - 1e-7 else np.inf
+    )
     assert either < 1e-7 if np.linalg.norm(w) > np.pi - 1e-3 else either < 1e-12
     assert np.linalg.norm(back) <= np.pi + 1e-12
 
@@ -123,7 +125,9 @@ def test_stacks_equal_single_items(xi: list[np.ndarray]) -> None:
     for i in range(len(stack)):
         np.testing.assert_allclose(T[i], se3_exp(stack[i]), atol=1e-12)
         np.testing.assert_allclose(adjoint(T)[i], adjoint(T[i]), atol=1e-12)
-        np.testing.assert_allclose(quaternion_from_matrix(T[:, :3, :3])[i], quaternion_from_matrix(T[i, :3, :3]))
+        np.testing.assert_allclose(
+            quaternion_from_matrix(T[:, :3, :3])[i], quaternion_from_matrix(T[i, :3, :3])
+        )
 
 
 @quick
