@@ -35,6 +35,7 @@ STILL_SPEED_M_S = 0.02
 STILL_GYRO_STD_RAD_S = 0.02
 STILL_ACCEL_STD_M_S2 = 0.25
 MAX_BIAS_RAD_S = 0.05
+LEAST_SAMPLES = 8
 MAX_MEAN_TILT_RAD = np.radians(45.0)
 LONGEST_STEP_NS = 20_000_000
 NOTHING = np.zeros((0, 2), np.int64)
@@ -206,15 +207,27 @@ def standstill_intervals(
     """
     if len(wheel_ns) > 1:
         return _runs(wheel_ns, np.abs(speed_m_s) < STILL_SPEED_M_S, round(least_s * 1e9))
-    if len(imu_ns) < 4:
+    if len(imu_ns) < LEAST_SAMPLES:
         return NOTHING
     second = (imu_ns - imu_ns[0]) // round(least_s * 1e9)
-    first_of, count = np.unique(second, return_index=True, return_counts=True)[1:]
-    starts = first_of[count >= 8]
-    quiet = [_quiet(gyro[i : i + n], accel[i : i + n]) for i, n in zip(starts, count[count >= 8])]
-    ends = [imu_ns[i + n - 1] for i, n in zip(starts, count[count >= 8])]
-    pairs = [(imu_ns[i], end) for i, end, still in zip(starts, ends, quiet) if still]
-    return np.array(pairs, np.int64).reshape(-1, 2)
+    first, count = np.unique(second, return_index=True, return_counts=True)[1:]
+    gyro_mean, gyro_std = _spread(gyro, first, count)
+    accel_std = _spread(accel, first, count)[1]
+    quiet = (
+        (count >= LEAST_SAMPLES)
+        & (gyro_std < STILL_GYRO_STD_RAD_S)
+        & ~(accel_std > STILL_ACCEL_STD_M_S2)  # an IMU without accelerometer gives NaN
+        & (np.linalg.norm(gyro_mean, axis=1) < MAX_BIAS_RAD_S)
+    )
+    still: I8 = np.column_stack((imu_ns[first], imu_ns[first + count - 1]))[quiet]
+    return still
+
+
+def _spread(value: F8, first: NDArray[np.intp], count: NDArray[np.intp]) -> tuple[F8, F8]:
+    """Mean (k, 3) of each group of rows, and the largest standard deviation (k,) of its columns."""
+    mean = np.add.reduceat(value, first) / count[:, None]
+    centered = value - np.repeat(mean, count, axis=0)
+    return mean, np.sqrt((np.add.reduceat(centered**2, first) / count[:, None]).max(axis=1))
 
 
 def gyro_bias(imu_ns: I8, gyro: F8, standstill: I8) -> F8:
@@ -222,7 +235,7 @@ def gyro_bias(imu_ns: I8, gyro: F8, standstill: I8) -> F8:
     means = []
     for start, end in standstill:
         part = gyro[np.searchsorted(imu_ns, start) : np.searchsorted(imu_ns, end, side="right")]
-        if len(part) >= 8 and np.all(part.std(axis=0) < STILL_GYRO_STD_RAD_S):
+        if len(part) >= LEAST_SAMPLES and np.all(part.std(axis=0) < STILL_GYRO_STD_RAD_S):
             means.append(part.mean(axis=0))
     if not means:
         return np.zeros(3)
@@ -232,17 +245,13 @@ def gyro_bias(imu_ns: I8, gyro: F8, standstill: I8) -> F8:
 
 def gravity_points_up(accel: F8, T_base_imu: F8) -> bool:
     """Whether the mean specific force is upward in the base frame; true when there is none to judge by."""
-    known = accel[np.isfinite(accel).all(axis=1)]
+    some = accel[:: max(1, len(accel) // 10_000)]
+    known = some[np.isfinite(some).all(axis=1)]
     if len(known) == 0:
         return True
     up = T_base_imu[:3, :3] @ np.median(known, axis=0)
     norm = float(np.linalg.norm(up))
     return norm < 5.0 or up[2] > norm * np.cos(MAX_MEAN_TILT_RAD)
-
-
-def _quiet(gyro: F8, accel: F8) -> bool:
-    shaking = gyro.std(axis=0).max() > STILL_GYRO_STD_RAD_S or accel.std(axis=0).max() > STILL_ACCEL_STD_M_S2
-    return not shaking and bool(np.linalg.norm(gyro.mean(axis=0)) < MAX_BIAS_RAD_S)
 
 
 def _runs(stamp_ns: I8, holds: NDArray[np.bool_], least_ns: int) -> I8:

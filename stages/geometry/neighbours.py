@@ -23,12 +23,12 @@ POINTS_PER_VOXEL = 20
 TARGET_SPACING_M = 0.3
 SOURCE_SPACING_M = 1.0
 TARGET_POINTS = 40_000
-SOURCE_POINTS = 1500
-COARSE_SCALE_M = 0.5
-FINE_SCALE_M = 0.15
+SOURCE_POINTS = 1200
+COARSE_SCALE_M, COARSE_STEPS = 0.5, 15
+FINE_SCALE_M, FINE_STEPS = 0.15, 4
 MOST_PASSES = 4
-SETTLED_M_S = 0.3  # 15 mm over half a sweep of 0.1 s
-SETTLED_RAD_S = 0.02  # 0.06 deg over half a sweep of 0.1 s
+SETTLED_M_S = 1.0  # a guess wrong by this leaves an error of about 2 % of it
+SETTLED_RAD_S = 0.1
 LEAST_INLIERS = 100
 LEAST_INLIER_SHARE = 0.6  # of the points that have a partner; scans that do not belong together reach 0.4
 LONGEST_PAUSE_S = 0.5
@@ -67,7 +67,7 @@ def twist_between(a: ThinScan, b: ThinScan, track: MotionTrack, guess: F8 | None
         return None
     twist = guess if guess is not None else _first_guess(a, b, track)
     for _ in range(MOST_PASSES):
-        found = _register(a, b, track, twist, FINE_SCALE_M, 8)
+        found = _register(a, b, track, twist, FINE_SCALE_M, FINE_STEPS)
         if not _fits(found, len(b.sparse)):
             return None
         before, twist = twist, se3_log(found.T_target_source) / pause_s
@@ -82,7 +82,9 @@ def _first_guess(a: ThinScan, b: ThinScan, track: MotionTrack) -> F8:
     pause_s = (b.reference_ns - a.reference_ns) * 1e-9
     best, best_twist = -1.0, np.zeros(6)
     for speed in FIRST_SPEEDS_M_S:
-        found = _register(a, b, track, np.concatenate((np.zeros(3), speed * forward)), COARSE_SCALE_M, 15)
+        found = _register(
+            a, b, track, np.concatenate((np.zeros(3), speed * forward)), COARSE_SCALE_M, COARSE_STEPS
+        )
         fit = found.inlier_ratio / (1e-3 + np.nan_to_num(found.rmse_m, nan=1.0))
         if fit > best:
             best, best_twist = fit, se3_log(found.T_target_source) / pause_s
