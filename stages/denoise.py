@@ -38,10 +38,12 @@ class Settings(BaseModel):
     min_range_m: float = Field(2.0, ge=0.0, le=20.0, description="nearer points are out of range, m")
     max_range_m: float = Field(100.0, ge=1.0, le=1000.0, description="farther points are out of range, m")
     ego_low_m: Corner = Field(
-        (-1.5, -0.9, -2.0), description="lower corner of the own vehicle in the base frame, m"
+        (-1.2, -1.0, 0.2),
+        description="lower corner of the own vehicle in the base frame, m; default: a car on the ground",
     )
     ego_high_m: Corner = Field(
-        (1.5, 0.9, 2.0), description="upper corner of the own vehicle in the base frame, m"
+        (3.8, 1.0, 1.9),
+        description="upper corner of the own vehicle in the base frame, m; it never reaches above the LiDAR",
     )
     outlier_neighbours: int = Field(
         3, ge=0, le=50, description="a point with fewer neighbours is an outlier, number; 0 keeps all"
@@ -104,6 +106,7 @@ def azimuth_step_rad(points: int, beams: int) -> float:
 def _bounded(x: F4, y: F4, z: F4, T: F8, low: F8, high: F8, nearest: float, farthest: float) -> U1:
     """OUT_OF_RANGE, EGO, or STATIC for the rest."""
     out = np.empty(len(x), np.uint8)
+    top = min(high[2], T[2, 3])
     for i in range(len(x)):
         px, py, pz = float(x[i]), float(y[i]), float(z[i])
         square = px * px + py * py + pz * pz
@@ -113,7 +116,7 @@ def _bounded(x: F4, y: F4, z: F4, T: F8, low: F8, high: F8, nearest: float, fart
         u = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
         v = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
         w = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        if low[0] < u < high[0] and low[1] < v < high[1] and low[2] < w < high[2]:
+        if low[0] < u < high[0] and low[1] < v < high[1] and low[2] < w < top:
             out[i] = EGO
         elif square < nearest * nearest:
             out[i] = OUT_OF_RANGE

@@ -173,9 +173,10 @@ def test_range_vehicle_and_broken_points() -> None:
             [0.2, 0.2, -0.9],
         ]
     )
-    settings = Settings(ego_low_m=(-1.5, -0.9, 0.3), ego_high_m=(3.0, 0.9, 1.8))
-    classes = labels_of(with_points(scan, odd), make_session(16, T_base_lidar), settings)[-len(odd) :]
+    classes = labels_of(with_points(scan, odd), make_session(16, T_base_lidar))[-len(odd) :]
     far, ego = PointClass.OUT_OF_RANGE, PointClass.EGO
+    bare = labels_of(with_points(scan, odd), make_session(16))[-len(odd) :]  # where the LiDAR is the base
+    assert not (bare == ego).any()
     assert classes.tolist() == [far, far, far, far, far, ego, ego]
 
 
