@@ -38,7 +38,9 @@ def _obey(words: list[str], root: Path | None) -> None:
         raise InvalidInput("the log is broken", where="log", next_step="bring another")
     if "odd" in words:
         raise KeyError("odd thing")
-    if "deadly" in words:
+    if "deadly" in words and root is not None:
+        with (root / "deaths").open("a") as deaths:
+            deaths.write("x")
         os._exit(9)
     if "once" in words and root is not None and not (root / "died").exists():
         (root / "died").touch()
