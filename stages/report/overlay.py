@@ -65,10 +65,10 @@ def scale_bar(view: View) -> list[Mark]:
                       [north - unit, 5 * unit]])  # fmt: skip
     text = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
     return [
-        Line(bar, INK, 0.22 * unit),
-        Label((x + end) / 2, y - unit, text, 1.5 * unit),
-        Line(arrow, INK, 0.22 * unit),
-        Label(north, 7 * unit, "N", 1.5 * unit),
+        Line(bar, INK, 0.3 * unit),
+        Label((x + end) / 2, y - unit, text, 1.9 * unit),
+        Line(arrow, INK, 0.3 * unit),
+        Label(north, 7 * unit, "N", 1.9 * unit),
     ]
 
 

@@ -62,7 +62,7 @@ def _lines(row: Mapping[str, Any]) -> list[dict[str, Any]]:
     for metric in row["metrics"]:
         by_session.setdefault(metric.get("session") or "", {})[metric["name"]] = metric
     whole = by_session.pop("", {})
-    names = list(by_session) or [""]
+    names = list(by_session) or [", ".join(row["sessions"])]
     return [
         {"session": name, "cells": [_cell({**(whole if i == 0 else {}), **by_session.get(name, {})}, column)
                                     for column, _ in FLEET_COLUMNS]}

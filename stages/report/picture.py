@@ -17,7 +17,7 @@ BACKGROUND = (13, 17, 23)
 _GROUND_CELL_M = 4.0
 _TALL_M = 9.0
 _RAMP = np.array(
-    [[38, 60, 92], [33, 113, 140], [42, 160, 134], [126, 196, 92], [236, 214, 96], [250, 236, 190]], float
+    [[62, 74, 102], [38, 112, 142], [42, 160, 134], [126, 196, 92], [236, 214, 96], [250, 236, 190]], float
 )
 """Colours from the ground up to `_TALL_M`."""
 
@@ -37,6 +37,12 @@ class View:
         x = (xy_m[:, 0] - self.left_m) / self.pixel_m
         y = self.height - (xy_m[:, 1] - self.bottom_m) / self.pixel_m
         return np.column_stack((x, y))
+
+    def enlarged(self, factor: int) -> View:
+        """The same window with more pixels."""
+        return View(
+            self.left_m, self.bottom_m, self.width * factor, self.height * factor, self.pixel_m / factor
+        )
 
 
 def fit_view(low_m: Any, high_m: Any, margin_m: float, longest: int, finest_m: float) -> View:
@@ -58,28 +64,36 @@ def draw_map(tiles: Iterable[Tile], view: View) -> NDArray[np.uint8]:
     bright = np.zeros((view.height, view.width), np.float32)
     cell = max(_GROUND_CELL_M, view.pixel_m)
     step = max(round(cell / view.pixel_m), 1)
-    low = np.full((view.height // step + 1, view.width // step + 1), np.inf, np.float32)
+    cells = (view.height // step + 1, view.width // step + 1)
+    low, soil = np.full(cells, np.inf, np.float32), np.zeros((*cells, 2))
     for tile in tiles:
         left, bottom = tile.offset_m[0] - view.left_m, tile.offset_m[1] - view.bottom_m
         _splat(
             tile.x_m, tile.y_m, tile.z_m, tile.offset_m[2], tile.intensity, tile.class_, int(PointClass.GROUND),
-            left, bottom, view.pixel_m, step, top, bright, low,
+            left, bottom, view.pixel_m, step, top, bright, low, soil,
         )  # fmt: skip
     if not np.isfinite(top).any():
         return np.full((view.height, view.width, 3), BACKGROUND, np.uint8)
-    ground = _ground(low, step, top.shape)
+    _close_gaps(top, bright)
+    ground = _ground(low, soil, step, top.shape)
     above = np.where(np.isfinite(top), top - ground, 0.0).astype(np.float32)
     return _shade(top, above, _stretch(bright, np.isfinite(top)), view.pixel_m)
 
 
-def _ground(low: NDArray[np.float32], step: int, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Height of the ground per pixel, from the lowest points of coarse cells, smoothed."""
+def _ground(
+    low: NDArray[np.float32], soil: NDArray[np.float64], step: int, shape: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Height of the ground per pixel: mean of the ground points of coarse cells, filled in and smoothed.
+
+    A map without ground points falls back on the lowest point of each cell.
+    """
     from scipy import ndimage
 
-    known = np.isfinite(low)
+    counted = soil[..., 1] > 0
+    height = soil[..., 0] / np.maximum(soil[..., 1], 1) if counted.any() else low
+    known = counted if counted.any() else np.isfinite(low)
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    filled = low[tuple(nearest)]
-    smooth = ndimage.gaussian_filter(ndimage.minimum_filter(filled, 3), 1.5)
+    smooth = ndimage.gaussian_filter(ndimage.median_filter(height[tuple(nearest)], 3), 1.0)
     fine = np.repeat(np.repeat(smooth, step, axis=0), step, axis=1)[: shape[0], : shape[1]]
     ground: NDArray[np.float32] = ndimage.uniform_filter(fine, step).astype(np.float32)
     return ground
@@ -103,7 +117,7 @@ def _shade(
     i = np.minimum(place.astype(int), len(_RAMP) - 2)
     share = (place - i)[..., None]
     colour = _RAMP[i] * (1 - share) + _RAMP[i + 1] * share
-    colour *= np.where(above < 0.4, 0.55 + 0.9 * bright, 1.0)[..., None] * light[..., None]
+    colour *= np.where(above < 0.4, 0.65 + 1.0 * bright, 1.0)[..., None] * light[..., None]
     empty = ~np.isfinite(top)
     colour[empty] = BACKGROUND
     image: NDArray[np.uint8] = np.clip(colour, 0, 255).astype(np.uint8)
@@ -115,8 +129,9 @@ def _splat(
     xs: NDArray[np.float32], ys: NDArray[np.float32], zs: NDArray[np.float32], z0: float,
     intensity: NDArray[np.float32], classes: NDArray[np.uint8], ground: int, left: float, bottom: float,
     pixel_m: float, step: int, top: NDArray[np.float32], bright: NDArray[np.float32], low: NDArray[np.float32],
+    soil: NDArray[np.float64],
 ) -> None:  # fmt: skip
-    """Keep per pixel the highest point and the brightest ground, and per coarse cell the lowest point."""
+    """Keep per pixel the highest point and the brightest ground; per coarse cell the lowest point and the sum of ground heights."""
     height, width = top.shape
     for i in range(len(xs)):
         px = np.int64(np.floor((xs[i] + left) / pixel_m))
@@ -126,10 +141,30 @@ def _splat(
         z = zs[i] + z0
         if z > top[py, px]:
             top[py, px] = z
-        if classes[i] == ground and intensity[i] > bright[py, px]:
-            bright[py, px] = intensity[i]
+        if classes[i] == ground:
+            bright[py, px] = max(bright[py, px], intensity[i])
+            soil[py // step, px // step, 0] += z
+            soil[py // step, px // step, 1] += 1.0
         if z < low[py // step, px // step]:
             low[py // step, px // step] = z
+
+
+@kernel
+def _close_gaps(top: NDArray[np.float32], bright: NDArray[np.float32]) -> None:
+    """Fill empty pixels that have three filled neighbours or more with their mean, in place, in one pass."""
+    height, width = top.shape
+    filled = np.isfinite(top)
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            if filled[y, x]:
+                continue
+            count, z, b = 0, 0.0, 0.0
+            for ny in range(y - 1, y + 2):
+                for nx in range(x - 1, x + 2):
+                    if filled[ny, nx]:
+                        count, z, b = count + 1, z + top[ny, nx], b + bright[ny, nx]
+            if count >= 3:
+                top[y, x], bright[y, x] = z / count, b / count
 
 
 @kernel
@@ -149,5 +184,5 @@ def _depth_light(top: NDArray[np.float32], pixel_m: float) -> NDArray[np.float32
                     if 0 <= ny < height and 0 <= nx < width and np.isfinite(top[ny, nx]):
                         rise = (top[ny, nx] - top[y, x]) / (reach * max(pixel_m, 0.2))
                         shadow += min(max(rise, 0.0), 4.0)
-            light[y, x] = np.exp(-0.09 * shadow)
+            light[y, x] = np.exp(-0.075 * shadow)
     return light

@@ -7,6 +7,7 @@ import io
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -129,10 +130,18 @@ def _picture(
     agreements: dict[str, Agreement],
 ) -> MapPicture:
     view = _view(settings, paths, index)
-    plain = draw_map(tiles, view)
+    plain, view = _enlarge(draw_map(tiles, view), view, settings.picture_px)
     fixes = {name: agreement.fixes for name, agreement in agreements.items()}
     marks: list[Mark] = map_marks(view, paths, loops, fixes) + scale_bar(view)
     return MapPicture(Image.fromarray(plain), paint(plain, marks), to_svg(marks, view))
+
+
+def _enlarge(picture: NDArray[np.uint8], view: View, longest: int) -> tuple[NDArray[np.uint8], View]:
+    """A small map with larger pixels, so that lines and letters on it are sharp."""
+    factor = max(longest // max(view.width, view.height), 1)
+    enlarged = view.enlarged(factor)
+    image = Image.fromarray(picture).resize((enlarged.width, enlarged.height), Image.Resampling.BICUBIC)
+    return np.asarray(image), enlarged
 
 
 def _view(settings: Settings, paths: dict[str, Poses], index: TileIndex) -> View:

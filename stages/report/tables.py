@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from scanloom.schemas.session import Session
 from scanloom.schemas.tiles import TileIndex
-from scanloom.stages.report.figures import Figures, Row, number
+from scanloom.stages.report.figures import Figures, Pair, Row, number
 
 Card = tuple[str, str, str]
 
@@ -36,11 +37,20 @@ def headline_cards(sessions: dict[str, Session], figures: Figures) -> list[Card]
     return cards
 
 
-def metric_tables(sessions: dict[str, Session], figures: Figures) -> dict[str, list[Row]]:
-    """Metrics per session, then those of the map, without empty tables."""
-    tables = {name: figures.rows(name) for name in sessions}
-    tables["the map"] = figures.rows()
-    return {name: rows for name, rows in tables.items() if rows}
+@dataclass(frozen=True)
+class MetricTable:
+    """Metrics of a session or of the map: those of odometry beside the map's, and the rest."""
+
+    title: str
+    pairs: list[Pair]
+    rows: list[Row]
+
+
+def metric_tables(sessions: dict[str, Session], figures: Figures) -> list[MetricTable]:
+    """A table per session and one of the map; empty ones are left out."""
+    tables = [MetricTable(f"Session {name}", figures.pairs(name), figures.single(name)) for name in sessions]
+    tables.append(MetricTable("Map", [], figures.single()))
+    return [table for table in tables if table.pairs or table.rows]
 
 
 def tile_rows(index: TileIndex) -> list[dict[str, Any]]:

@@ -64,9 +64,9 @@ def _map_checks(limits: Limits, figures: Figures, gnss_median_m: dict[str, float
     accepted = figures.get("loops.accepted") or 0
     precision = figures.get("loops.precision")
     if precision is not None and precision < 1.0:
-        yield Check("fail", f"{100 * (1 - precision):.1f} % of the accepted loops are false.")
+        yield Check("fail", f"{100 * (1 - precision):.1f} % of the accepted loops are wrong.")
     elif precision is not None:
-        yield Check("pass", f"All {number(accepted)} accepted loops are true.")
+        yield Check("pass", "All accepted loops that truth can judge are right.")
     elif accepted:
         yield Check("pass", f"{number(accepted)} loops hold the map together.")
     georeferenced = bool(figures.get("fusion.georeferenced"))

@@ -1,0 +1,281 @@
+"""The report: deterministic bytes, sane pages for odd maps, a verdict that follows the figures."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from html.parser import HTMLParser
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from scanloom.schemas.evaluation import ErrorTrack, Metrics, ReportFiles
+from scanloom.schemas.frames import Georeference
+from scanloom.schemas.loops import Loops
+from scanloom.schemas.product import Parts
+from scanloom.schemas.session import Problem, Session, Topic
+from scanloom.schemas.tiles import Tile, TileIndex
+from scanloom.schemas.tracks import Gnss
+from scanloom.schemas.trajectory import Poses
+from scanloom.stages.evaluation import evaluation
+from scanloom.stages.evaluation.stage import Settings as EvaluationSettings
+from scanloom.stages.geometry.geodesy import georeference, world_to_geodetic
+from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.report import report
+from scanloom.stages.report.page import compose, fleet_page, run_section
+from scanloom.stages.report.stage import Settings
+from scanloom.stages.tiling import overview
+from scanloom.stages.tiling.overview import Settings as OverviewSettings
+from tests.stages.mapping import (
+    Source,
+    loops_of,
+    no_gnss,
+    odometry_of,
+    one,
+    pieces_of,
+    poses_of,
+    session_of,
+    stamps,
+    tile_parts,
+    tiles_of,
+    truth_of,
+)
+from tests.worlds import drive, street
+
+VOID = {"meta", "img", "link", "br", "hr"}
+
+
+class Balanced(HTMLParser):
+    """Fails on tags that do not match; keeps the text, and every address that is asked for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.text = ""
+        self.addresses: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in VOID:
+            self.open.append(tag)
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        pass
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def parse(page: str) -> Balanced:
+    parser = Balanced()
+    parser.feed(page)
+    assert parser.open == []
+    return parser
+
+
+class Map:
+    """A mapped street and what the report reads of it; any product can be replaced."""
+
+    def __init__(self) -> None:
+        self.scans, self.T = drive(street(), 5, step_m=8.0)
+        self.tiles = tile_parts(tiles_of([Source("a", "0000", pieces_of(self.scans, self.T))]))
+        self.index, _ = overview(OverviewSettings(), self.tiles)
+
+    def report(self, **changed: Any) -> ReportFiles:
+        given: dict[str, Any] = {
+            "session": one(session_of(scans=5)), "metrics": None, "error_track": None, "poses": one(poses_of(self.T)),
+            "loops": Loops.empty(), "tile_index": self.index, "tiles": self.tiles, "gnss": one(no_gnss()), **changed,
+        }  # fmt: skip
+        if given["metrics"] is None:
+            given["metrics"], given["error_track"] = self.evaluate(given)
+        return report(Settings(picture_px=400), **given)
+
+    def evaluate(
+        self, given: dict[str, Any], odometry: F8 | None = None
+    ) -> tuple[Metrics, Parts[ErrorTrack]]:
+        *tracks, metrics = evaluation(
+            EvaluationSettings(), given["session"], one(truth_of(self.T)),
+            one(odometry_of(self.T if odometry is None else odometry)), given["poses"], given["loops"], given["tiles"],
+        )  # fmt: skip
+        return metrics, Parts([((("session", part.key),), part.product) for part in tracks])  # type: ignore[return-value, union-attr]
+
+
+@pytest.fixture(scope="module")
+def street_map() -> Map:
+    return Map()
+
+
+def body(files: ReportFiles) -> str:
+    return files.read("body.html").decode()
+
+
+def test_the_same_map_gives_the_same_bytes(street_map: Map) -> None:
+    one_, two = street_map.report(), street_map.report()
+    assert one_.read("body.html") == two.read("body.html")
+    assert one_.read("preview.png") == two.read("preview.png")
+
+
+def test_the_page_is_one_file_without_outside_references(street_map: Map) -> None:
+    page = compose(body(street_map.report()), run_section([], {}), "street")
+    parser = parse(page)
+    assert all(address.startswith("data:") for address in parser.addresses)
+    assert "@import" not in page
+    assert "url(" not in page
+    assert "<script" not in page
+    assert 20_000 < len(page) < 1_000_000
+
+
+def test_a_good_map_is_called_good_and_says_why(street_map: Map) -> None:
+    text = parse(body(street_map.report())).text
+    assert "Good" in text
+    assert "5 of 5 scans registered" in text
+    assert "within 0.00 m of truth" in text
+    assert "Not georeferenced" in text
+
+
+def test_the_picture_shows_walls_ground_and_emptiness(street_map: Map) -> None:
+    image = np.asarray(Image.open(io.BytesIO(street_map.report().read("preview.png"))))
+    assert 300 <= max(image.shape[:2]) <= 420
+    dark = (image.astype(int).sum(axis=2) < 70).mean()
+    assert 0.1 < dark < 0.95
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 500
+
+
+def test_gnss_agreement_is_measured_and_drawn(street_map: Map) -> None:
+    origin = georeference(48.1, 11.6, 520.0)
+    poses = poses_of(street_map.T, georeference=origin.model_dump())
+    index = replace(street_map.index, georeference=origin.model_dump(), frame="world")
+    near = body(
+        street_map.report(
+            poses=one(poses),
+            tile_index=index,
+            gnss=one(fixes(origin, street_map.T[:, :3, 3] + [0.6, 0.8, 5.0])),
+        )
+    )
+    assert "agree to 1.00 m" in near
+    assert "GNSS fix" in near
+    assert f"EPSG:{origin.epsg}" in near
+    far = body(
+        street_map.report(poses=one(poses), gnss=one(fixes(origin, street_map.T[:, :3, 3] + [40, 0, 0])))
+    )
+    assert "Poor" in parse(far).text
+
+
+def fixes(origin: Georeference, positions: F8) -> Gnss:
+    where = world_to_geodetic(origin, positions)
+    n = len(positions)
+    return Gnss(
+        stamp_ns=stamps(n), latitude_deg=where[:, 0].copy(), longitude_deg=where[:, 1].copy(), height_m=where[:, 2].copy(),
+        covariance_m2=np.tile(np.eye(3), (n, 1, 1)), status=np.zeros(n, np.int8), satellites=np.full(n, 9, np.int16),
+    )  # fmt: skip
+
+
+def test_false_loops_spoil_the_verdict(street_map: Map) -> None:
+    loops = loops_of(street_map.T, [(0, 4)], [5.0])
+    text = parse(body(street_map.report(loops=loops))).text
+    assert "Poor" in text
+    assert "100.0 % of the accepted loops are wrong" in text
+
+
+def test_problems_of_the_log_reach_the_page_and_are_escaped(street_map: Map) -> None:
+    topic = Topic(
+        name="/<script>alert(1)</script>",
+        type="x",
+        role="lidar",
+        messages=5,
+        rate_hz=10.0,
+        first_ns=0,
+        last_ns=1,
+    )
+    problem = Problem(code="imu.gap", severity="error", text="silent for <b>2 s</b>", topic="/imu")
+    session = session_of("a", 5, topics=(topic,), problems=(problem,), complete=False)
+    page = compose(body(street_map.report(session=one(session))), run_section([], {"<i>": "<u>"}), "<title>")
+    assert "<script>" not in page
+    assert "<b>2 s" not in page
+    assert "<i>" not in page
+    text = parse(page).text
+    assert "Fair" in text
+    assert "silent for <b>2 s</b>" in text
+    assert "the log is incomplete" in text
+
+
+def test_no_truth_no_tiles_one_scan_still_give_a_page(street_map: Map) -> None:
+    nothing = Metrics.empty()
+    index = TileIndex.empty(frame="map", georeference=None, tile_size_m=50.0, voxel_size_m=0.1)
+    empty: Parts[Tile] = Parts([])
+    one_scan = poses_of(street_map.T[:1])
+    for poses in (one_scan, Poses.empty(frame="map", georeference=None)):
+        files = street_map.report(
+            metrics=nothing, error_track=Parts([]), poses=one(poses), tile_index=index, tiles=empty
+        )
+        text = parse(body(files)).text
+        assert "Poor" in text
+        assert "The map holds no points" in text
+        assert "No truth was given" in text
+        assert Image.open(io.BytesIO(files.read("preview.png"))).size[0] >= 16
+
+
+def test_two_sessions_have_two_colours_and_two_tables(street_map: Map) -> None:
+    both = {"a": street_map.T, "b": street_map.T + 0.0}
+    sessions: Parts[Session] = Parts([((("session", n),), session_of(n, 5)) for n in both])
+    poses: Parts[Poses] = Parts([((("session", n),), poses_of(T)) for n, T in both.items()])
+    files = street_map.report(session=sessions, poses=poses)
+    page = body(files)
+    assert page.count("<polyline") >= 4
+    parse(page)
+
+
+def test_run_section_shows_times_and_provenance() -> None:
+    rows = [
+        {"stage": "deskew", "tasks": 3, "executed": 2, "wall_s": 4.0, "peak_rss_mb": 310.4},
+        {"stage": "odometry", "tasks": 1, "executed": 0, "wall_s": 0.0, "peak_rss_mb": 0.0},
+    ]
+    section = run_section(rows, {"scanloom": "0.1.0"})
+    text = parse(section).text
+    assert "width: 100.0%" in section
+    assert "4.00" in text
+    assert "310" in text
+    assert "0.1.0" in text
+
+
+def metric(name: str, value: float, previous: float | None, session: str = "") -> dict[str, Any]:
+    return {
+        "name": name,
+        "value": value,
+        "unit": "",
+        "scope": "map",
+        "session": session,
+        "previous": previous,
+    }
+
+
+def test_fleet_page_shows_changes_failures_and_links() -> None:
+    rows = [
+        {
+            "map": "harbour", "sessions": ["mon", "tue"], "delivered": True, "report": "maps/harbour/report.html",
+            "new": False, "warnings": ["tue: clock jumps"], "failures": [],
+            "metrics": [
+                metric("fusion.ate_rmse_m", 0.2, 0.3, "mon"), metric("fusion.ate_rmse_m", 0.4, 0.3, "tue"),
+                metric("map.points", 2000.0, 1000.0),
+            ],
+        },
+        {
+            "map": "depot", "sessions": ["x.bag"], "delivered": False, "report": None, "new": True, "warnings": [],
+            "failures": ["x.bag: holds no 3D LiDAR"], "metrics": [],
+        },
+    ]  # fmt: skip
+    page = fleet_page(rows, made="today")
+    parser = parse(page)
+    assert parser.addresses == ["maps/harbour/report.html"]
+    assert page.count('class="change better"') == 1
+    assert page.count('class="change worse"') == 1
+    assert page.count('class="change soft"') == 1
+    assert "x.bag: holds no 3D LiDAR" in parser.text
+    assert "clock jumps" in parser.text
+    assert "1 of 2" in parser.text
+    parse(fleet_page([], made="today"))
