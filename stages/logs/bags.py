@@ -140,7 +140,7 @@ def open_bags(raw_log: RawLog, format: str) -> BagLog:
         if opener is None:
             continue
         try:
-            files.append(opener(raw_log.path(name)))
+            files.append(_opened(opener, raw_log.path(name)))
         except InvalidInput as error:
             errors.append(error)
             opening.texts.append(f"{name} cannot be opened: {error.what}")
@@ -149,6 +149,17 @@ def open_bags(raw_log: RawLog, format: str) -> BagLog:
     if not files:
         raise errors[0] if errors else InvalidInput("The folder holds no bag file.", where=str(raw_log.root))
     return BagLog(format, files, opening=opening)
+
+
+def _opened(opener: Callable[[Path], Container], path: Path) -> Container:
+    try:
+        return opener(path)
+    except OSError as error:
+        raise InvalidInput(
+            f"The file cannot be read ({error.strerror}).",
+            where=str(path),
+            next_step="check the file and the free space",
+        ) from error
 
 
 def _opener(name: str) -> Callable[[Path], Container] | None:

@@ -73,15 +73,25 @@ class DatabaseFile:
         path, mode = self.path, "mode=ro&immutable=1"
         if wal.is_file() and wal.stat().st_size:
             # the recorder died: its last messages are in the log beside the database; merging them writes
-            self._scratch = tempfile.TemporaryDirectory(prefix="scanloom-")
-            path, mode = Path(self._scratch.name) / "log.db3", "mode=rw"
-            shutil.copyfile(self.path, path)
-            shutil.copyfile(wal, path.with_name("log.db3-wal"))
+            path, mode = self._copy(self.path.stat().st_size), "mode=rw"
+            shutil.copyfile(wal, path.with_name(path.name + "-wal"))
+        elif beyond := self.path.stat().st_size % _page_bytes(self.path):
+            # SQLite takes a page that is cut for one that ends in zeros, and a cloud with it
+            path = self._copy(self.path.stat().st_size - beyond)
         base = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{mode}", uri=True, check_same_thread=False)
         # a file shorter than its header says is refused otherwise
         base.execute("PRAGMA writable_schema=ON")
         base.text_factory = lambda raw: raw.decode("utf-8", "replace")
         return base
+
+    def _copy(self, size: int) -> Path:
+        """The first `size` bytes as a temporary file that lives as long as this object."""
+        self._scratch = tempfile.TemporaryDirectory(prefix="scanloom-")
+        path = Path(self._scratch.name) / "log.db3"
+        with self.path.open("rb") as source, path.open("wb") as target:
+            shutil.copyfileobj(source, target, 1 << 22)
+            target.truncate(size)
+        return path
 
     def _channels(self) -> None:
         rows = self._base.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
@@ -113,9 +123,7 @@ class DatabaseFile:
     def _note_list_damage(self, error: str) -> None:
         size = self.path.stat().st_size
         with self.path.open("rb") as stream:
-            head = stream.read(32)
-        page = int.from_bytes(head[16:18], "big") or 512
-        declared = (65536 if page == 1 else page) * int.from_bytes(head[28:32], "big")
+            declared = _page_bytes(self.path) * int.from_bytes(stream.read(32)[28:32], "big")
         lost = max(declared - size, 0)
         share = f"; {100 * lost / declared:.0f} % of the file is missing" if lost else ""
         self.damage.texts.append(f"the database is damaged ({error}){share}")
@@ -132,3 +140,10 @@ class DatabaseFile:
 def _begins(path: Path, magic: bytes) -> bool:
     with path.open("rb") as stream:
         return stream.read(len(magic)) == magic
+
+
+def _page_bytes(path: Path) -> int:
+    """Page size from the header of the database (SQLite file format, section 1.3.2)."""
+    with path.open("rb") as stream:
+        page = int.from_bytes(stream.read(18)[16:18], "big")
+    return 65536 if page == 1 else max(page, 512)

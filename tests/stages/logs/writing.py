@@ -19,7 +19,9 @@ ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", 
 START_NS = 1_700_000_000_000_000_000
 SCAN_NS = 100_000_000
 ROWS, COLUMNS = 4, 96
-DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")])
+DTYPE = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")]
+)
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,9 @@ def fix(store: Any, ns: int, status: int = 0) -> Any:
 def odometry(store: Any, ns: int, speed: float = 3.0) -> Any:
     t = store.types
     position = t["geometry_msgs/msg/Point"](x=1.0, y=2.0, z=3.0)
-    twist = t["geometry_msgs/msg/Twist"](linear=vector(store, speed, 0.0, 0.0), angular=vector(store, 0.0, 0.0, 0.25))
+    twist = t["geometry_msgs/msg/Twist"](
+        linear=vector(store, speed, 0.0, 0.0), angular=vector(store, 0.0, 0.0, 0.25)
+    )
     return t["nav_msgs/msg/Odometry"](
         header=header(store, ns, "odom"), child_frame_id="base_link",
         pose=t["geometry_msgs/msg/PoseWithCovariance"](
@@ -134,18 +138,43 @@ def drive(store: Any, scans: int = 5) -> Iterator[Item]:
     items = [Item("/tf_static", "tf2_msgs/msg/TFMessage", START_NS, transforms(store, START_NS, MOUNTING))]
     for i in range(scans):
         ns = START_NS + i * SCAN_NS
-        items.append(Item("/points", "sensor_msgs/msg/PointCloud2", ns + SCAN_NS + 2_000_000, cloud(store, ns, cloud_points(i))))
+        items.append(
+            Item(
+                "/points",
+                "sensor_msgs/msg/PointCloud2",
+                ns + SCAN_NS + 2_000_000,
+                cloud(store, ns, cloud_points(i)),
+            )
+        )
     end_ns = scans * SCAN_NS
     for offset in range(0, end_ns, 10_000_000):
-        items.append(Item("/imu", "sensor_msgs/msg/Imu", START_NS + offset + 2_000_000, imu(store, START_NS + offset)))
+        items.append(
+            Item("/imu", "sensor_msgs/msg/Imu", START_NS + offset + 2_000_000, imu(store, START_NS + offset))
+        )
     for offset in range(0, end_ns, 200_000_000):
-        items.append(Item("/fix", "sensor_msgs/msg/NavSatFix", START_NS + offset + 2_000_000, fix(store, START_NS + offset)))
+        items.append(
+            Item(
+                "/fix",
+                "sensor_msgs/msg/NavSatFix",
+                START_NS + offset + 2_000_000,
+                fix(store, START_NS + offset),
+            )
+        )
     for offset in range(0, end_ns, 50_000_000):
-        items.append(Item("/odom", "nav_msgs/msg/Odometry", START_NS + offset + 2_000_000, odometry(store, START_NS + offset)))
+        items.append(
+            Item(
+                "/odom",
+                "nav_msgs/msg/Odometry",
+                START_NS + offset + 2_000_000,
+                odometry(store, START_NS + offset),
+            )
+        )
     return iter(sorted(items, key=lambda item: item.receive_ns))
 
 
-def write_rosbag2(folder: Path, items: Iterator[Item], storage: str = "mcap", compression: str = "none") -> Path:
+def write_rosbag2(
+    folder: Path, items: Iterator[Item], storage: str = "mcap", compression: str = "none"
+) -> Path:
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     writer = Writer2(folder, version=9, storage_plugin=plugin)
     if compression != "none":
@@ -155,11 +184,15 @@ def write_rosbag2(folder: Path, items: Iterator[Item], storage: str = "mcap", co
         for item in items:
             if item.topic not in connections:
                 connections[item.topic] = writer.add_connection(item.topic, item.type, typestore=ROS2)
-            writer.write(connections[item.topic], item.receive_ns, ROS2.serialize_cdr(item.message, item.type))
+            writer.write(
+                connections[item.topic], item.receive_ns, ROS2.serialize_cdr(item.message, item.type)
+            )
     return folder
 
 
-def write_rosbag1(path: Path, items: Iterator[Item], compression: str = "none", chunk_bytes: int = 4096) -> Path:
+def write_rosbag1(
+    path: Path, items: Iterator[Item], compression: str = "none", chunk_bytes: int = 4096
+) -> Path:
     writer = Writer1(path)
     if compression != "none":
         writer.set_compression(Writer1.CompressionFormat[compression.upper()])
@@ -169,7 +202,9 @@ def write_rosbag1(path: Path, items: Iterator[Item], compression: str = "none", 
         for item in items:
             if item.topic not in connections:
                 connections[item.topic] = writer.add_connection(item.topic, item.type, typestore=ROS1)
-            writer.write(connections[item.topic], item.receive_ns, ROS1.serialize_ros1(item.message, item.type))
+            writer.write(
+                connections[item.topic], item.receive_ns, ROS1.serialize_ros1(item.message, item.type)
+            )
     return path
 
 
@@ -195,7 +230,11 @@ def write_mcap(
                 text, _ = store.generate_msgdef(item.type, ros_version=1 if ros1 else 2)
                 schema = writer.register_schema(name, "ros1msg" if ros1 else "ros2msg", text.encode())
                 channels[item.topic] = writer.register_channel(item.topic, "ros1" if ros1 else "cdr", schema)
-            raw = store.serialize_ros1(item.message, item.type) if ros1 else store.serialize_cdr(item.message, item.type)
+            raw = (
+                store.serialize_ros1(item.message, item.type)
+                if ros1
+                else store.serialize_cdr(item.message, item.type)
+            )
             writer.add_message(channels[item.topic], item.receive_ns, bytes(raw), item.receive_ns)
         writer.finish()
     return path
