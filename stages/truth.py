@@ -15,7 +15,7 @@ from scanloom.schemas.session import IDENTITY, Matrix4, Problem, RawLog, TruthLo
 from scanloom.schemas.trajectory import Truth
 from scanloom.stages.geometry.geodesy import geodetic_to_world, georeference
 from scanloom.stages.geometry.se3 import F8, inverse, matrix_from_quaternion, pose
-from scanloom.stages.logs.kitti import Oxts, read_calibration, read_oxts, read_seconds, read_T_velo_imu
+from scanloom.stages.logs.oxts import Oxts, read_calibration, read_oxts, read_seconds, read_T_velo_imu
 
 VERSION = 1
 

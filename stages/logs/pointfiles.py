@@ -7,8 +7,9 @@ from functools import partial
 from pathlib import Path
 
 from scanloom.schemas.errors import InvalidInput
-from scanloom.schemas.session import Problem, RawLog, Severity
-from scanloom.stages.logs.kitti import POINT_BYTES, FolderLog, read_velodyne
+from scanloom.schemas.session import Problem, RawLog
+from scanloom.stages.logs.folder import FolderLog, problem
+from scanloom.stages.logs.kitti import POINT_BYTES, read_velodyne
 from scanloom.stages.logs.pcd import LONGEST_HEADER, read_pcd, read_pcd_header
 from scanloom.stages.logs.ply import read_ply, read_ply_header
 from scanloom.stages.logs.pointcloud import TIME_NAMES, cloud_from_table
@@ -43,7 +44,9 @@ def open_point_files(raw_log: RawLog, rate_hz: float = 10.0) -> FolderLog:
         try:
             timeless += not set(TIME_NAMES) & set(_look(path))
         except InvalidInput as error:
-            problems.append(_problem("points.broken", "warning", f"{name} {error.what}; left out", stamp_ns))
+            problems.append(
+                problem("points.broken", "warning", f"{name} {error.what}; left out", TOPIC, stamp_ns)
+            )
             continue
         scans.append(CloudFile(stamp_ns, stamp_ns, partial(read_points, path, stamp_ns), str(path)))
     if not scans:
@@ -57,7 +60,7 @@ def open_point_files(raw_log: RawLog, rate_hz: float = 10.0) -> FolderLog:
             f"{timeless} of {len(scans)} scans have no point times; they are taken as not motion-compensated, "
             "one turn each. If they are compensated, set ingest.point_time to none"
         )
-        problems.append(_problem("points.no_times", "info", text))
+        problems.append(problem("points.no_times", "info", text, TOPIC))
     scans.sort(key=lambda scan: scan.stamp_ns)
     return FolderLog("point files", scans, {}, (), tuple(problems), scan_topic=TOPIC)
 
@@ -135,12 +138,8 @@ def _stamps(names: list[str], rate_hz: float, problems: list[Problem]) -> list[i
     if len(stamps) == len(names) and len(set(stamps)) == len(stamps):
         return stamps
     text = f"file names are not times; {rate_hz:g} scans per second are assumed"
-    problems.append(_problem("points.rate_assumed", "info", text))
+    problems.append(problem("points.rate_assumed", "info", text, TOPIC))
     return [round(i * 1e9 / rate_hz) for i in range(len(names))]
-
-
-def _problem(code: str, severity: Severity, text: str, stamp_ns: int = 0) -> Problem:
-    return Problem(code=code, severity=severity, text=text, topic=TOPIC, stamp_ns=stamp_ns)
 
 
 def _plausible(seconds: int) -> bool:
