@@ -23,6 +23,9 @@ from scanloom.stages.geometry.se3 import F8
 
 Texts = NDArray[np.object_]
 
+MOST_COMPARED = 2000
+"""Fixes a fix is compared with; bounds the time for a vehicle that stands for hours."""
+
 
 class GnssSettings(BaseModel):
     """Gates and weights of GNSS positions."""
@@ -162,7 +165,7 @@ def consistent_chain(residual: F8, path: F8, sigma_m: F8, settings: GnssSettings
     n = len(residual)
     length = np.ones(n, np.int64)
     previous = np.full(n, -1, np.int64)
-    start = np.searchsorted(path, path - settings.chain_m)
+    start = np.maximum(np.searchsorted(path, path - settings.chain_m), np.arange(n) - MOST_COMPARED)
     for k in range(1, n):
         a = np.arange(start[k], k)
         if not len(a):
