@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -165,8 +164,12 @@ def _opened(opener: Callable[[Path], Container], path: Path) -> Container:
 def _opener(name: str) -> Callable[[Path], Container] | None:
     if name.endswith(".zstd"):
         inner = _opener(name.removesuffix(".zstd"))
-        return partial(PackedFile, inner=inner) if inner else None
+        return _packed(inner) if inner else None
     return _OPENERS.get(Path(name).suffix)
+
+
+def _packed(inner: Callable[[Path], Container]) -> Callable[[Path], Container]:
+    return lambda path: PackedFile(path, inner)
 
 
 _OPENERS: dict[str, Callable[[Path], Container]] = {

@@ -69,8 +69,11 @@ class Block:
 class Container(Protocol):
     """One file of a log, opened and indexed, its messages not yet read."""
 
-    path: Path
-    damage: Damage
+    @property
+    def path(self) -> Path: ...
+
+    @property
+    def damage(self) -> Damage: ...
 
     @property
     def channels(self) -> dict[int, Channel]: ...

@@ -216,9 +216,9 @@ def _bags(path: Path, files: Sequence[Path]) -> Located | None:
     for bag in bags:
         if bag.stat().st_size or len(bags) == 1:
             check_file(bag)
-    names = [p.name for p in files if p in bags or p.name == "metadata.yaml" or p.name.endswith(".db3-wal")]
-    found = detect(names)
-    return Located(path.resolve().name, found, RawLog(path.resolve(), tuple(names)), truth_beside(path))
+    held = [p.name for p in files if p in bags or p.name == "metadata.yaml" or p.name.endswith(".db3-wal")]
+    found = detect(held)
+    return Located(path.resolve().name, found, RawLog(path.resolve(), tuple(held)), truth_beside(path))
 
 
 def _scans(path: Path, files: Sequence[Path]) -> Located | None:

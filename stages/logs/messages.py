@@ -186,6 +186,11 @@ def _field(c: Cursor) -> PointField:
     return PointField(name, int(c.number("I")), int(c.number("B")), int(c.number("I")))
 
 
+_LIVOX_CODES = (
+    ("offset_time", "u4"), ("x", "f4"), ("y", "f4"), ("z", "f4"), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1"),
+)  # fmt: skip
+
+
 def _livox(c: Cursor, receive_ns: int) -> Body:
     stamp_ns, frame = c.header()
     timebase_ns = int(c.number("Q"))
@@ -196,14 +201,8 @@ def _livox(c: Cursor, receive_ns: int) -> Body:
     stride = LIVOX_POINT.itemsize if c.ros1 else 20
     needed = max(count * stride - (stride - LIVOX_POINT.itemsize), 0)
     raw = bytes(c.take(needed)) + bytes(stride - LIVOX_POINT.itemsize if count else 0)
-    layout = np.dtype(
-        {
-            "names": LIVOX_POINT.names,
-            "formats": [LIVOX_POINT[name].newbyteorder(c.order) for name in LIVOX_POINT.names or ()],
-            "offsets": [LIVOX_POINT.fields[name][1] for name in LIVOX_POINT.names or ()],  # type: ignore[index]
-            "itemsize": stride,
-        }
-    )
+    padding = [] if c.ros1 else [("padding", "u1")]
+    layout = np.dtype([(name, c.order + code) for name, code in _LIVOX_CODES] + padding)
     return LivoxCloud(stamp_ns, receive_ns, frame, timebase_ns, np.frombuffer(raw, layout, count))
 
 

@@ -29,36 +29,43 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    lidar_topic: str = Field("", description=f"point cloud {_TOPIC}")
-    imu_topic: str = Field("", description=f"IMU {_TOPIC}")
-    gnss_topic: str = Field("", description=f"GNSS {_TOPIC}")
-    wheel_topic: str = Field("", description=f"wheel speed {_TOPIC}")
+    lidar_topic: str = Field(default="", description=f"point cloud {_TOPIC}")
+    imu_topic: str = Field(default="", description=f"IMU {_TOPIC}")
+    gnss_topic: str = Field(default="", description=f"GNSS {_TOPIC}")
+    wheel_topic: str = Field(default="", description=f"wheel speed {_TOPIC}")
     scan_rate_hz: float = Field(
-        10.0, ge=0.5, le=100, description="scan rate of folders of scans, which carry no time, Hz"
+        default=10.0, ge=0.5, le=100, description="scan rate of folders of scans, which carry no time, Hz"
     )
     stamp_source: Literal["header", "receive"] = Field(
-        "header", description="stamps of the sensors, or the times of recording"
+        default="header", description="stamps of the sensors, or the times of recording"
     )
     point_time: Literal["auto", "azimuth", "none"] = Field(
-        "auto", description="auto: from the points, else from azimuth; none: every point has its scan's stamp"
+        default="auto",
+        description="auto: from the points, else from azimuth; none: every point has its scan's stamp",
     )
     vertical_correction_deg: float = Field(
-        0.0, ge=-2, le=2, description="raises every beam; 0.205 for KITTI's HDL-64E (IMLS-SLAM, 2018), deg"
+        default=0.0,
+        ge=-2,
+        le=2,
+        description="raises every beam; 0.205 for KITTI's HDL-64E (IMLS-SLAM, 2018), deg",
     )
     align_clocks: bool = Field(
-        True,
+        default=True,
         description="shift a sensor whose clock differs from the LiDAR's by more than a second, using receive times",
     )
-    imu_offset_s: float = Field(0.0, ge=-3600, le=3600, description=f"IMU: {_OFFSET}")
-    gnss_offset_s: float = Field(0.0, ge=-3600, le=3600, description=f"GNSS: {_OFFSET}")
-    wheel_offset_s: float = Field(0.0, ge=-3600, le=3600, description=f"wheels: {_OFFSET}")
-    lidar_on_base: Mounting = Field(None, description=f"LiDAR: {_MOUNT}")
-    imu_on_base: Mounting = Field(None, description=f"IMU: {_MOUNT}")
-    gnss_on_base: Mounting = Field(None, description=f"GNSS antenna: {_MOUNT}")
-    wheel_on_base: Mounting = Field(None, description=f"point whose speed is measured: {_MOUNT}")
-    chunk_s: float = Field(20.0, ge=1, le=600, description="length of a chunk, s")
+    imu_offset_s: float = Field(default=0.0, ge=-1e10, le=1e10, description=f"IMU: {_OFFSET}")
+    gnss_offset_s: float = Field(default=0.0, ge=-1e10, le=1e10, description=f"GNSS: {_OFFSET}")
+    wheel_offset_s: float = Field(default=0.0, ge=-1e10, le=1e10, description=f"wheels: {_OFFSET}")
+    lidar_on_base: Mounting = Field(default=None, description=f"LiDAR: {_MOUNT}")
+    imu_on_base: Mounting = Field(default=None, description=f"IMU: {_MOUNT}")
+    gnss_on_base: Mounting = Field(default=None, description=f"GNSS antenna: {_MOUNT}")
+    wheel_on_base: Mounting = Field(default=None, description=f"point whose speed is measured: {_MOUNT}")
+    chunk_s: float = Field(default=20.0, ge=1, le=600, description="length of a chunk, s")
     chunk_points: int = Field(
-        4_000_000, ge=1000, le=200_000_000, description="a chunk ends earlier when it holds this many points"
+        default=4_000_000,
+        ge=1000,
+        le=200_000_000,
+        description="a chunk ends earlier when it holds this many points",
     )
 
     def wanted_topics(self) -> dict[str, str]:

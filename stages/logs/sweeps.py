@@ -220,4 +220,5 @@ def _returns(cloud: Cloud) -> NDArray[np.bool_]:
     near: NDArray[np.bool_] = (
         (np.abs(x) < _FARTHEST_M) & (np.abs(y) < _FARTHEST_M) & (np.abs(z) < _FARTHEST_M)
     )
-    return near & ((x != 0) | (y != 0) | (z != 0))
+    seen: NDArray[np.bool_] = near & ((x != 0) | (y != 0) | (z != 0))
+    return seen
