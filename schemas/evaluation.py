@@ -34,7 +34,9 @@ class ErrorTrack(Table):
 
     stamp_ns: NDArray[np.int64] = column("i8", "reference time of the scan", unit="ns")
     travelled_m: NDArray[np.float64] = column("f8", "path length so far, from truth", unit="m")
-    odometry_error_m: NDArray[np.float64] = column("f8", "distance to truth, odometry aligned at the first scan", unit="m")
+    odometry_error_m: NDArray[np.float64] = column(
+        "f8", "distance to truth, odometry aligned at the first scan", unit="m"
+    )
     fusion_error_m: NDArray[np.float64] = column("f8", "distance to truth, map aligned as a whole", unit="m")
 
 

@@ -19,7 +19,9 @@ class Places(Table):
 
     scan_index: NDArray[np.int64] = column("i8", "number of the keyframe's scan in its session")
     stamp_ns: NDArray[np.int64] = column("i8", "reference time of the scan", unit="ns")
-    descriptor: NDArray[np.float32] = column("f4", "scan context: highest point per ring and sector, row by row", unit="m", shape=(20, 60))
+    descriptor: NDArray[np.float32] = column(
+        "f4", "scan context: highest point per ring and sector, row by row", unit="m", shape=(20, 60)
+    )
     max_radius_m: float = attribute("radius of the outermost ring, m")
 
 
@@ -33,9 +35,15 @@ class Loops(Table):
     scan_i: NDArray[np.int64] = column("i8", "number of scan i in its session")
     session_j: NDArray[np.object_] = column("str", "session of scan j")
     scan_j: NDArray[np.int64] = column("i8", "number of scan j in its session")
-    T_i_j: NDArray[np.float64] = column("f8", "pose of LiDAR j in LiDAR i from geometric verification", unit="m", shape=(4, 4))
-    covariance: NDArray[np.float64] = column("f8", "of T_i_j, order (rotation, translation), right tangent", shape=(6, 6))
-    descriptor_distance: NDArray[np.float64] = column("f8", "scan context distance, 0 same to 1 different; NaN for candidates by position")
+    T_i_j: NDArray[np.float64] = column(
+        "f8", "pose of LiDAR j in LiDAR i from geometric verification", unit="m", shape=(4, 4)
+    )
+    covariance: NDArray[np.float64] = column(
+        "f8", "of T_i_j, order (rotation, translation), right tangent", shape=(6, 6)
+    )
+    descriptor_distance: NDArray[np.float64] = column(
+        "f8", "scan context distance, 0 same to 1 different; NaN for candidates by position"
+    )
     inlier_ratio: NDArray[np.float64] = column("f8", "share of points of submap j with a partner in submap i")
     rmse_m: NDArray[np.float64] = column("f8", "root mean square residual of the inliers", unit="m")
     overlap: NDArray[np.float64] = column("f8", "share of voxels of submap j that submap i also fills")

@@ -21,9 +21,14 @@ class Graph(Table):
     key_i: NDArray[np.object_] = column("str", "first pose")
     key_j: NDArray[np.object_] = column("str", "second pose; empty for a factor on one pose")
     measurement: NDArray[np.float64] = column(
-        "f8", "relative pose of a between factor; for gnss the position in the last column", unit="m", shape=(4, 4)
+        "f8",
+        "relative pose of a between factor; for gnss the position in the last column",
+        unit="m",
+        shape=(4, 4),
     )
-    covariance: NDArray[np.float64] = column("f8", "order (rotation, translation); unused rows are zero", shape=(6, 6))
+    covariance: NDArray[np.float64] = column(
+        "f8", "order (rotation, translation); unused rows are zero", shape=(6, 6)
+    )
     residual_before: NDArray[np.float64] = column("f8", "whitened norm at the initial values")
     residual_after: NDArray[np.float64] = column("f8", "whitened norm at the solution")
     weight: NDArray[np.float64] = column("f8", "final robust weight, 0 switched off to 1 trusted")

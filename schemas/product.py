@@ -17,7 +17,6 @@ import io
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import IO, Any, ClassVar, Generic, Self, TypeVar
 
@@ -150,7 +149,7 @@ class Table(Product):
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        with _damage_named(path):
+        with _NamingDamage(path):
             file = pq.ParquetFile(path, page_checksum_verification=True)
             footer = _read_footer(file, cls, path)
             return cls.from_arrow(file.read(use_threads=False), footer["attributes"], str(path))
@@ -206,7 +205,7 @@ class Stream(Product, Generic[ItemT]):
     @classmethod
     def open(cls, path: Path, through: Through = iter) -> Self:
         """`through` wraps each pass over the items of the file, for instance to read ahead."""
-        with _damage_named(path):
+        with _NamingDamage(path):
             file = pq.ParquetFile(path, page_checksum_verification=True)
             footer = _read_footer(file, cls, path)
         return cls(_FileItems(path, cls.ITEM, footer["attributes"]["items"], through))
@@ -215,7 +214,9 @@ class Stream(Product, Generic[ItemT]):
 class _FileItems:
     """Items of a stream in a file: row group i is item i, also when it is empty."""
 
-    def __init__(self, path: Path, item: type[Table], index: list[dict[str, Any]], through: Through = iter) -> None:
+    def __init__(
+        self, path: Path, item: type[Table], index: list[dict[str, Any]], through: Through = iter
+    ) -> None:
         self.path = path
         self._through = through
         self.item = item
@@ -228,13 +229,13 @@ class _FileItems:
         return self._through(self._pass())
 
     def _pass(self) -> Iterator[Any]:
-        with _damage_named(self.path):
+        with _NamingDamage(self.path):
             file = pq.ParquetFile(self.path, page_checksum_verification=True)
         for i in range(len(self.index)):
             yield self._read(file, i)
 
     def __getitem__(self, i: int) -> Any:
-        with _damage_named(self.path):
+        with _NamingDamage(self.path):
             file = pq.ParquetFile(self.path, page_checksum_verification=True)
         return self._read(file, i)
 
@@ -242,7 +243,7 @@ class _FileItems:
         attributes = {k: v for k, v in self.index[i].items() if k != "rows"}
         if not self.index[i]["rows"]:
             return self.item.empty(**attributes)
-        with _damage_named(self.path):
+        with _NamingDamage(self.path):
             rows = file.read_row_group(i, use_threads=False)
             return self.item.from_arrow(rows, attributes, f"{self.path}, row group {i}")
 
@@ -377,17 +378,32 @@ class Parts(Sequence[ProductT]):
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-@cache
+ValueT = TypeVar("ValueT")
+
+
+def _per_type(function: Callable[[type[Table]], ValueT]) -> Callable[[type[Table]], ValueT]:
+    """Remember what a function says of each table; tables are declared once and never change."""
+    known: dict[type[Table], ValueT] = {}
+
+    def remembered(table: type[Table]) -> ValueT:
+        if table not in known:
+            known[table] = function(table)
+        return known[table]
+
+    return remembered
+
+
+@_per_type
 def columns_of(table: type[Table]) -> dict[str, Column]:
     return {f.name: f.metadata["column"] for f in dataclasses.fields(table) if "column" in f.metadata}
 
 
-@cache
+@_per_type
 def attributes_of(table: type[Table]) -> dict[str, str]:
     return {f.name: f.metadata["attribute"] for f in dataclasses.fields(table) if "attribute" in f.metadata}
 
 
-@cache
+@_per_type
 def arrow_schema(table: type[Table]) -> pa.Schema:
     fields = []
     for name, spec in columns_of(table).items():
@@ -453,7 +469,7 @@ def _from_arrow(chunked: pa.ChunkedArray, spec: Column, name: str, where: str) -
     return flat.reshape(-1, *spec.shape) if spec.shape else flat
 
 
-@cache
+@_per_type
 def _writer_options(table: type[Table]) -> dict[str, Any]:
     """Encodings per leaf: byte-stream split for floats, deltas for stamps, dictionaries for strings."""
     encodings: dict[str, str] = {}
@@ -518,7 +534,7 @@ def _damaged(path: Path, error: Exception) -> ProductError:
     )
 
 
-class _damage_named:
+class _NamingDamage:
     """Turns read errors of Arrow into a `ProductError` that names the file."""
 
     def __init__(self, path: Path) -> None:
@@ -528,5 +544,7 @@ class _damage_named:
         return None
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, (OSError, ValueError, KeyError, pa.ArrowException)) and not isinstance(error, ProductError):
+        if isinstance(error, (OSError, ValueError, KeyError, pa.ArrowException)) and not isinstance(
+            error, ProductError
+        ):
             raise _damaged(self.path, error) from error

@@ -20,7 +20,9 @@ class Piece(Table):
 
     voxel: NDArray[np.int32] = column("i4", "voxel index from the tile's corner", shape=(3,))
     count: NDArray[np.int32] = column("i4", "points summed")
-    sum_m: NDArray[np.float64] = column("f8", "sum of coordinates from the tile's corner", unit="m", shape=(3,))
+    sum_m: NDArray[np.float64] = column(
+        "f8", "sum of coordinates from the tile's corner", unit="m", shape=(3,)
+    )
     sum_intensity: NDArray[np.float64] = column("f8", "sum of intensities")
     ground_count: NDArray[np.int32] = column("i4", "points of class ground among them")
     scan_count: NDArray[np.int32] = column("i4", "scans that hit the voxel")
@@ -37,8 +39,12 @@ class Tile(Table):
     NAME: ClassVar[str] = "tile"
     SPLIT_BY: ClassVar[str] = "tile"
 
-    x_m: NDArray[np.float32] = column("f4", "from the tile's origin, along x of the map", unit="m", frame="tile")
-    y_m: NDArray[np.float32] = column("f4", "from the tile's origin, along y of the map", unit="m", frame="tile")
+    x_m: NDArray[np.float32] = column(
+        "f4", "from the tile's origin, along x of the map", unit="m", frame="tile"
+    )
+    y_m: NDArray[np.float32] = column(
+        "f4", "from the tile's origin, along y of the map", unit="m", frame="tile"
+    )
     z_m: NDArray[np.float32] = column("f4", "from the tile's origin, up", unit="m", frame="tile")
     intensity: NDArray[np.float32] = column("f4", "mean intensity of the voxel's points")
     class_: NDArray[np.uint8] = column("u1", "a value of PointClass: ground or static")
@@ -68,8 +74,12 @@ class TileIndex(Table):
     tile: NDArray[np.object_] = column("str", "name of the tile, `X_Y` in steps of the tile size")
     level: NDArray[np.int32] = column("i4", "0 is the full resolution")
     points: NDArray[np.int64] = column("i8", "points in the tile")
-    min_m: NDArray[np.float64] = column("f8", "lowest corner of the points", unit="m", shape=(3,), frame="world or map")
-    max_m: NDArray[np.float64] = column("f8", "highest corner of the points", unit="m", shape=(3,), frame="world or map")
+    min_m: NDArray[np.float64] = column(
+        "f8", "lowest corner of the points", unit="m", shape=(3,), frame="world or map"
+    )
+    max_m: NDArray[np.float64] = column(
+        "f8", "highest corner of the points", unit="m", shape=(3,), frame="world or map"
+    )
     sessions: NDArray[np.object_] = column("str", "sessions that contributed, separated by spaces")
     checksum: NDArray[np.object_] = column("str", "SHA-256 of the tile's columns")
     frame: str = attribute("`world` or `map`")

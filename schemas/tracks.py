@@ -19,7 +19,9 @@ class Imu(Table):
 
     stamp_ns: NDArray[np.int64] = column("i8", "time of the measurement", unit="ns")
     gyro_rad_s: NDArray[np.float64] = column("f8", "angular rate", unit="rad/s", shape=(3,), frame="imu")
-    accel_m_s2: NDArray[np.float64] = column("f8", "specific force (+9.8 up at rest)", unit="m/s2", shape=(3,), frame="imu")
+    accel_m_s2: NDArray[np.float64] = column(
+        "f8", "specific force (+9.8 up at rest)", unit="m/s2", shape=(3,), frame="imu"
+    )
 
 
 @dataclass(frozen=True)
@@ -31,11 +33,15 @@ class Gnss(Table):
     stamp_ns: NDArray[np.int64] = column("i8", "time of the fix", unit="ns")
     latitude_deg: NDArray[np.float64] = column("f8", "WGS84 latitude; NaN without fix", unit="deg")
     longitude_deg: NDArray[np.float64] = column("f8", "WGS84 longitude; NaN without fix", unit="deg")
-    height_m: NDArray[np.float64] = column("f8", "height above the WGS84 ellipsoid; NaN without fix", unit="m")
+    height_m: NDArray[np.float64] = column(
+        "f8", "height above the WGS84 ellipsoid; NaN without fix", unit="m"
+    )
     covariance_m2: NDArray[np.float64] = column(
         "f8", "receiver's covariance of east, north, up, row by row", unit="m2", shape=(3, 3)
     )
-    status: NDArray[np.int8] = column("i1", "NavSatStatus: -1 no fix, 0 fix, 1 satellite-based, 2 ground-based (RTK)")
+    status: NDArray[np.int8] = column(
+        "i1", "NavSatStatus: -1 no fix, 0 fix, 1 satellite-based, 2 ground-based (RTK)"
+    )
     satellites: NDArray[np.int16] = column("i2", "satellites used; -1 when the receiver does not tell")
 
 
@@ -46,5 +52,9 @@ class Wheel(Table):
     NAME: ClassVar[str] = "wheel"
 
     stamp_ns: NDArray[np.int64] = column("i8", "time of the measurement", unit="ns")
-    speed_m_s: NDArray[np.float64] = column("f8", "speed along x of the base, negative backwards", unit="m/s", frame="base")
-    yaw_rate_rad_s: NDArray[np.float64] = column("f8", "turn rate about z of the base; NaN when not given", unit="rad/s")
+    speed_m_s: NDArray[np.float64] = column(
+        "f8", "speed along x of the base, negative backwards", unit="m/s", frame="base"
+    )
+    yaw_rate_rad_s: NDArray[np.float64] = column(
+        "f8", "turn rate about z of the base; NaN when not given", unit="rad/s"
+    )

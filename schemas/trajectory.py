@@ -19,7 +19,9 @@ class Odometry(Table):
 
     scan_index: NDArray[np.int64] = column("i8", "number of the scan in its session")
     stamp_ns: NDArray[np.int64] = column("i8", "reference time of the scan", unit="ns")
-    T_odom_lidar: NDArray[np.float64] = column("f8", "pose of the LiDAR", unit="m", shape=(4, 4), frame="odom")
+    T_odom_lidar: NDArray[np.float64] = column(
+        "f8", "pose of the LiDAR", unit="m", shape=(4, 4), frame="odom"
+    )
     covariance: NDArray[np.float64] = column(
         "f8",
         "covariance of the motion since the previous scan, order (rotation, translation), right tangent",
@@ -27,10 +29,16 @@ class Odometry(Table):
         shape=(6, 6),
         frame="lidar",
     )
-    inlier_ratio: NDArray[np.float64] = column("f8", "share of the used points that found a partner in the local map")
+    inlier_ratio: NDArray[np.float64] = column(
+        "f8", "share of the used points that found a partner in the local map"
+    )
     rmse_m: NDArray[np.float64] = column("f8", "root mean square of the point-to-plane residuals", unit="m")
-    degeneracy_d: NDArray[np.float64] = column("f8", "D: smallest eigenvalue of the translation information, per point")
-    degeneracy_e: NDArray[np.float64] = column("f8", "E1: residual-scaled worst standard deviation of translation", unit="m")
+    degeneracy_d: NDArray[np.float64] = column(
+        "f8", "D: smallest eigenvalue of the translation information, per point"
+    )
+    degeneracy_e: NDArray[np.float64] = column(
+        "f8", "E1: residual-scaled worst standard deviation of translation", unit="m"
+    )
     direction_p: NDArray[np.float64] = column(
         "f8", "probability that each eigen-direction is observed beyond noise", shape=(6,)
     )
@@ -38,7 +46,9 @@ class Odometry(Table):
         "f8", "eigenvectors of the information as columns, weakest first", shape=(6, 6), frame="lidar"
     )
     keyframe: NDArray[np.bool_] = column("?", "scan is part of the local map and of the pose graph")
-    reliable: NDArray[np.bool_] = column("?", "registration converged; false where motion was bridged by prediction")
+    reliable: NDArray[np.bool_] = column(
+        "?", "registration converged; false where motion was bridged by prediction"
+    )
 
 
 @dataclass(frozen=True)
@@ -50,7 +60,9 @@ class Poses(Table):
 
     scan_index: NDArray[np.int64] = column("i8", "number of the scan in its session")
     stamp_ns: NDArray[np.int64] = column("i8", "reference time of the scan", unit="ns")
-    T_world_lidar: NDArray[np.float64] = column("f8", "pose of the LiDAR", unit="m", shape=(4, 4), frame="world or map")
+    T_world_lidar: NDArray[np.float64] = column(
+        "f8", "pose of the LiDAR", unit="m", shape=(4, 4), frame="world or map"
+    )
     covariance: NDArray[np.float64] = column(
         "f8", "marginal covariance, order (rotation, translation), right tangent", shape=(6, 6), frame="lidar"
     )
@@ -66,5 +78,7 @@ class Truth(Table):
     NAME: ClassVar[str] = "truth"
 
     stamp_ns: NDArray[np.int64] = column("i8", "time of the pose, on the LiDAR's clock", unit="ns")
-    T_truth_lidar: NDArray[np.float64] = column("f8", "pose of the LiDAR", unit="m", shape=(4, 4), frame="truth")
+    T_truth_lidar: NDArray[np.float64] = column(
+        "f8", "pose of the LiDAR", unit="m", shape=(4, 4), frame="truth"
+    )
     source: str = attribute("where the truth comes from and how far to trust it, in words")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+
 from scanloom.pipeline.run import Result, run
 from scanloom.pipeline.store import Store
 from scanloom.workflows.build_map import Order, request_of
@@ -45,7 +46,11 @@ def map_small(folder: Path, cluster: str = "none", workers: int | None = None) -
 @pytest.fixture(scope="session")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Mapped:
     """The small sample mapped in this process; made once even when tests run side by side."""
-    shared = tmp_path_factory.getbasetemp().parent if os.environ.get("PYTEST_XDIST_WORKER") else tmp_path_factory.getbasetemp()
+    shared = (
+        tmp_path_factory.getbasetemp().parent
+        if os.environ.get("PYTEST_XDIST_WORKER")
+        else tmp_path_factory.getbasetemp()
+    )
     folder = shared / "small-sample"
     folder.mkdir(exist_ok=True)
     with (folder / "lock").open("w") as lock:

@@ -118,7 +118,9 @@ def _deliver_figures(order: Order, result: Result) -> list[Metric]:
     write_text(order.out / METRICS_FILE, json.dumps(metrics, indent=1) + "\n")
     if result.executed or not (order.out / REPORT_FILE).exists():
         body = result.files(ReportFiles)[0][1] / "body.html"
-        page = compose(body.read_text(), run_section(_stage_times(result), _provenance(order, figures)), order.name)
+        page = compose(
+            body.read_text(), run_section(_stage_times(result), _provenance(order, figures)), order.name
+        )
         write_text(order.out / REPORT_FILE, page)
     return metrics
 
@@ -135,7 +137,9 @@ def _measured(order: Order, result: Result) -> list[Metric]:
         row("run.wall_s", wall_s, "s", "from the start of the command to the delivery of the map"),
         row("run.log_s", log_s, "s", "length of all logs, first to last message"),
         row("run.realtime_factor", log_s / wall_s, "", "seconds of log per second of run"),
-        row("run.peak_rss_mb", peak_mb, "MB", "resident memory of all processes of the run together, sampled"),
+        row(
+            "run.peak_rss_mb", peak_mb, "MB", "resident memory of all processes of the run together, sampled"
+        ),
         row("run.tasks_executed", result.executed, "", "tasks computed, not found in the store"),
         row("run.tasks", len(result.tasks), "", "tasks of the run"),
     ]

@@ -24,7 +24,8 @@ app = typer.Typer(
 )
 
 StoreOption = Annotated[
-    Path | None, typer.Option("--store", help="Folder of the artifact store (default $SCANLOOM_STORE or ./store).")
+    Path | None,
+    typer.Option("--store", help="Folder of the artifact store (default $SCANLOOM_STORE or ./store)."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable result on stdout.")]
 SetOption = Annotated[
@@ -33,7 +34,9 @@ SetOption = Annotated[
 ClusterOption = Annotated[
     str, typer.Option("--cluster", help="local, none, tcp://host:port or module:factory.")
 ]
-WorkersOption = Annotated[int | None, typer.Option("--workers", min=1, help="Local processes (default: one per core).")]
+WorkersOption = Annotated[
+    int | None, typer.Option("--workers", min=1, help="Local processes (default: one per core).")
+]
 ProjectOption = Annotated[
     Path | None, typer.Option("--project", help="Settings file (default ./scanloom.yaml when present).")
 ]
@@ -44,13 +47,12 @@ def main() -> None:
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
     logging.getLogger("scanloom").setLevel(logging.INFO)
     try:
-        app(standalone_mode=False)
+        code = app(standalone_mode=False)
+        sys.exit(code if isinstance(code, int) else EXIT_OK)
     except ScanloomError as error:
         _fail(str(error), error.exit_code)
     except KeyboardInterrupt:
         _fail("interrupted; the same command continues where it stopped", EXIT_INTERRUPTED)
-    except typer.Exit as exit_:
-        sys.exit(exit_.exit_code)
     except Exception as error:
         _unexpected(error)
 
@@ -87,14 +89,18 @@ def _store_folder(given: Path | None) -> Path:
 
 @app.command("map")
 def map_command(
-    sessions: Annotated[list[str], typer.Argument(help="Logs: bag, folder, .mcap, KITTI folder, session.yaml, or `sample`.")],
+    sessions: Annotated[
+        list[str], typer.Argument(help="Logs: bag, folder, .mcap, KITTI folder, session.yaml, or `sample`.")
+    ],
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the map (default maps/NAME).")] = None,
     store: StoreOption = None,
     cluster: ClusterOption = "local",
     workers: WorkersOption = None,
     settings: SetOption = None,
     project: ProjectOption = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would run and why; compute nothing.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would run and why; compute nothing.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Logs into a map: trajectory, tiles, metrics and a report."""
@@ -126,7 +132,8 @@ def map_command(
 def _show_plan(tasks: list[Any], errors: list[tuple[str, ScanloomError]], as_json: bool) -> None:
     if as_json:
         rows = [
-            {"node": t.node, "coordinate": t.coordinate, "verdict": t.verdict, "reason": t.reason} for t in tasks
+            {"node": t.node, "coordinate": t.coordinate, "verdict": t.verdict, "reason": t.reason}
+            for t in tasks
         ]
         _emit({"tasks": rows, "failures": [str(error) for _, error in errors]})
     else:
@@ -142,8 +149,8 @@ def _show_plan(tasks: list[Any], errors: list[tuple[str, ScanloomError]], as_jso
 def _show_outcome(outcome: Any, as_json: bool) -> None:
     for text in outcome.warnings:
         _say(f"warning: {text}")
-    for place, error in outcome.failures:
-        _say(f"scanloom: {place}: {error}")
+    for _, error in outcome.failures:
+        _say(f"scanloom: {error}")
     if as_json:
         _emit(
             {
@@ -202,19 +209,22 @@ def inspect(
 ) -> None:
     """What is in a log, what would be used, what is wrong with it; computes nothing."""
     from scanloom.workflows.configuration import command_line_settings
-    from scanloom.workflows.inspection import inspection_of, text_of
+    from scanloom.workflows.inspection import exit_code_of, inspection_of, text_of
 
     found = inspection_of(session, command_line_settings(settings or []))
     if as_json:
-        _emit(found)
+        _emit(found.as_json())
     else:
         print(text_of(found))
+    raise typer.Exit(exit_code_of(found))
 
 
 @app.command()
 def nightly(
     fleet: Annotated[Path, typer.Argument(help="FLEET.yaml: maps, each with sessions by path or glob.")],
-    out: Annotated[Path | None, typer.Option("--out", help="Folder of the maps and the summary (default: the file's).")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder of the maps and the summary (default: the file's).")
+    ] = None,
     store: StoreOption = None,
     cluster: ClusterOption = "local",
     workers: WorkersOption = None,

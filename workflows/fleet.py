@@ -29,7 +29,9 @@ class Fleet(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     maps: dict[str, MapEntry] = {}
-    each: list[str] = Field(default=[], description="paths or globs; every log that matches becomes a map of its own")
+    each: list[str] = Field(
+        default=[], description="paths or globs; every log that matches becomes a map of its own"
+    )
     out: str = Field(default="night", description="folder of maps and summary, relative to the fleet file")
     settings: dict[str, dict[str, Any]] = {}
 

@@ -17,7 +17,9 @@ Json = dict[str, Any]
 
 def _open(folder: Path) -> Store:
     if not folder.is_dir():
-        raise UsageError("there is no store here", where=str(folder), next_step="give --store, or map something first")
+        raise UsageError(
+            "there is no store here", where=str(folder), next_step="give --store, or map something first"
+        )
     return Store(folder)
 
 
@@ -25,7 +27,9 @@ def explanation(store: Path, artifact: str) -> Json:
     """Why one artifact is what it is. `artifact` is a key, the start of one, or the artifact's folder."""
     found = upkeep.explain(_open(store), Path(artifact).name if "/" in artifact else artifact)
     outputs = [
-        {"path": f.path, "bytes": f.size, "sha256": f.sha256} for part in found.artifact.parts for f in part.files
+        {"path": f.path, "bytes": f.size, "sha256": f.sha256}
+        for part in found.artifact.parts
+        for f in part.files
     ]
     return {
         "stage": found.artifact.stage,
@@ -50,7 +54,9 @@ def text_of_explanation(found: Json) -> str:
     ]
     for i in found["inputs"]:
         made_by = ", ".join(i["made_by"]) or "a file from outside"
-        lines.append(f"reads     {i['product']} ({i['parts']} part{'s' * (i['parts'] != 1)}) made by {made_by}")
+        lines.append(
+            f"reads     {i['product']} ({i['parts']} part{'s' * (i['parts'] != 1)}) made by {made_by}"
+        )
     lines += [f"wrote     {o['path']}  {o['bytes']} bytes  {o['sha256'][:16]}" for o in found["outputs"]]
     if found["before"]:
         lines.append(f"since {found['before'][:16]}: " + "; ".join(found["changes"] or ["nothing"]))
@@ -73,14 +79,18 @@ def store_status(store: Path) -> Json:
 
 def text_of_status(found: Json) -> str:
     lines = [f"{found['root']}   {found['bytes'] / 1e6:.1f} MB"]
-    lines += [f"  {s['stage']:12} {s['artifacts']:6} artifacts {s['bytes'] / 1e6:10.1f} MB" for s in found["stages"]]
+    lines += [
+        f"  {s['stage']:12} {s['artifacts']:6} artifacts {s['bytes'] / 1e6:10.1f} MB" for s in found["stages"]
+    ]
     for r in found["runs"]:
         when = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(r["started_unix_s"]))
         counts = ", ".join(f"{n} {verdict}" for verdict, n in sorted(r["verdicts"].items()))
         lines.append(f"run {r['number']:4}  {when}  {r['state']:11} {r['wall_s']:8.1f} s  {counts}")
     lines += [f"failed: {f['task']}: {f['error']}" for f in found["failures"]]
     if found["leftovers"] or found["quarantined"]:
-        lines.append(f"{found['leftovers']} leftovers, {found['quarantined']} in quarantine; `scanloom gc` removes them")
+        lines.append(
+            f"{found['leftovers']} leftovers, {found['quarantined']} in quarantine; `scanloom gc` removes them"
+        )
     return "\n".join(lines)
 
 

@@ -99,21 +99,24 @@ def _row(name: str, sessions: list[str], outcome: Outcome, folder: Path) -> dict
         "executed": outcome.executed,
         "metrics": outcome.metrics,
         "warnings": outcome.warnings,
-        "failures": [f"{place}: {error}" for place, error in outcome.failures],
+        "failures": [str(error) for _, error in outcome.failures],
     }
 
 
 def with_changes(rows: list[dict[str, Any]], last_night: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Each metric with its value of last night under `previous`, where there was one."""
     before = {
-        (row["map"], m["name"], m.get("session", "")): m["value"] for row in last_night for m in row["metrics"]
+        (row["map"], m["name"], m.get("session", "")): m["value"]
+        for row in last_night
+        for m in row["metrics"]
     }
     return [
         {
             **row,
             "new": row["map"] not in {r["map"] for r in last_night},
             "metrics": [
-                {**m, "previous": before.get((row["map"], m["name"], m.get("session", "")))} for m in row["metrics"]
+                {**m, "previous": before.get((row["map"], m["name"], m.get("session", "")))}
+                for m in row["metrics"]
             ],
         }
         for row in rows

@@ -36,8 +36,11 @@ def _products_page() -> str:
     for n in NODES:
         for product in (*n.reads, *n.writes):
             seen.setdefault(product.NAME, product)
-    return NOTE + "# Products\n\n" + _first_paragraphs(sys.modules[Product.__module__].__doc__ or "") + "".join(
-        _product_section(product) for product in seen.values()
+    return (
+        NOTE
+        + "# Products\n\n"
+        + _first_paragraphs(sys.modules[Product.__module__].__doc__ or "")
+        + "".join(_product_section(product) for product in seen.values())
     )
 
 
@@ -52,7 +55,8 @@ def _product_section(product: type[Product]) -> str:
     if issubclass(product, Files):
         return text
     columns = [
-        (name, c.dtype + "".join(f"[{s}]" for s in c.shape), c.unit, c.frame, c.doc) for name, c in describe(product)
+        (name, c.dtype + "".join(f"[{s}]" for s in c.shape), c.unit, c.frame, c.doc)
+        for name, c in describe(product)
     ]
     text += _table(("column", "type", "unit", "frame", "meaning"), columns)
     item = product.ITEM if issubclass(product, Stream) else product
@@ -62,7 +66,8 @@ def _product_section(product: type[Product]) -> str:
 
 def _stages_page() -> str:
     rows = [
-        (f"[{n.name}](stages/{n.name}.md)", n.per, _names(n.reads), _names(n.writes), _summary(n)) for n in NODES
+        (f"[{n.name}](stages/{n.name}.md)", n.per, _names(n.reads), _names(n.writes), _summary(n))
+        for n in NODES
     ]
     return NOTE + "# Stages\n" + _table(("stage", "per", "reads", "writes", "what it does"), rows)
 
@@ -81,7 +86,14 @@ def _settings_table(n: Node) -> str:
     rows = []
     for name, field in n.settings.model_fields.items():
         bounds = ", ".join(str(m) for m in field.metadata)
-        rows.append((f"`{n.name}.{name}`", f"`{_shown(field.get_default(call_default_factory=True))}`", bounds, field.description or ""))
+        rows.append(
+            (
+                f"`{n.name}.{name}`",
+                f"`{_shown(field.get_default(call_default_factory=True))}`",
+                bounds,
+                field.description or "",
+            )
+        )
     return _table(("setting", "default", "bounds", "meaning"), rows) if rows else "\nNone.\n"
 
 
@@ -104,7 +116,9 @@ def _names(products: Iterable[type[Product]]) -> str:
 
 def _table(head: tuple[str, ...], rows: Iterable[tuple[object, ...]]) -> str:
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    lines += ["| " + " | ".join(str(c).replace("|", "\\|").replace("\n", " ") for c in row) + " |" for row in rows]
+    lines += [
+        "| " + " | ".join(str(c).replace("|", "\\|").replace("\n", " ") for c in row) + " |" for row in rows
+    ]
     return "\n" + "\n".join(lines) + "\n"
 
 

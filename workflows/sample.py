@@ -24,7 +24,9 @@ def write_sample(folder: Path, store: Path, settings: Overrides) -> list[str]:
     ------
     UsageError : the folder holds something else.
     """
-    if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / "metadata.yaml").exists()):
+    if folder.is_file() or (
+        folder.is_dir() and any(folder.iterdir()) and not (folder / "metadata.yaml").exists()
+    ):
         raise UsageError("is not an empty folder", where=str(folder), next_step="give a new folder")
     nodes = tuple(n for n in NODES if n.only == SIMULATED)
     session = SessionInput(name=SAMPLE, sources={}, tags=frozenset({SIMULATED}))

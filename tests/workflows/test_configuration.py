@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import pytest
+
 from scanloom.schemas.errors import UsageError
 from scanloom.workflows.configuration import command_line_settings, merged, project_settings
 
 
 def test_values_are_yaml() -> None:
-    given = command_line_settings(["odometry.voxel_size_m=0.4", "ingest.lidar_topic=/a/b", "denoise.ego=true"])
+    given = command_line_settings(
+        ["odometry.voxel_size_m=0.4", "ingest.lidar_topic=/a/b", "denoise.ego=true"]
+    )
     assert given == {
         "odometry": {"voxel_size_m": 0.4},
         "ingest": {"lidar_topic": "/a/b"},
@@ -23,7 +26,10 @@ def test_malformed_assignment_is_named(text: str) -> None:
 
 
 def test_later_layers_win_field_by_field() -> None:
-    assert merged({"a": {"x": 1, "y": 2}}, {"a": {"x": 3}, "b": {"z": 4}}) == {"a": {"x": 3, "y": 2}, "b": {"z": 4}}
+    assert merged({"a": {"x": 1, "y": 2}}, {"a": {"x": 3}, "b": {"z": 4}}) == {
+        "a": {"x": 3, "y": 2},
+        "b": {"z": 4},
+    }
 
 
 def test_project_file(tmp_path, monkeypatch) -> None:

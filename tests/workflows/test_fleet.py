@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+
 from scanloom.schemas.errors import UsageError
 from scanloom.workflows.fleet import read_fleet, sessions_by_map
 
@@ -18,7 +19,9 @@ def _fleet(tmp_path: Path, text: str) -> Path:
 def test_globs_and_groups(tmp_path: Path) -> None:
     for name in ("b.mcap", "a.mcap", "c.bag"):
         (tmp_path / name).touch()
-    fleet = read_fleet(_fleet(tmp_path, "maps: {depot: {sessions: ['*.mcap', sample]}}\neach: ['*.bag', 'gone.bag']\n"))
+    fleet = read_fleet(
+        _fleet(tmp_path, "maps: {depot: {sessions: ['*.mcap', sample]}}\neach: ['*.bag', 'gone.bag']\n")
+    )
     assert sessions_by_map(fleet, tmp_path) == {
         "depot": [str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap"), "sample"],
         "c": [str(tmp_path / "c.bag")],

@@ -36,7 +36,15 @@ def mapped(tmp_path_factory) -> Path:
 
 def test_everything_is_delivered(mapped: Path) -> None:
     out = mapped / "out"
-    for name in ("map.ply", "trajectory.parquet", "trajectory.tum", "metrics.json", "report.html", "preview.png", "map.json"):
+    for name in (
+        "map.ply",
+        "trajectory.parquet",
+        "trajectory.tum",
+        "metrics.json",
+        "report.html",
+        "preview.png",
+        "map.json",
+    ):
         assert (out / name).stat().st_size > 0, name
     tum = np.loadtxt(out / "trajectory.tum")
     assert tum.shape == (14, 8)
@@ -53,7 +61,9 @@ def test_metrics_have_name_value_unit_scope_method(mapped: Path) -> None:
     assert all({"name", "value", "unit", "scope", "method"} <= set(row) for row in rows)
     values = {row["name"]: row["value"] for row in rows}
     assert values["run.peak_rss_mb"] > 50
-    assert values["run.realtime_factor"] == pytest.approx(values["run.log_s"] / values["run.wall_s"], rel=0.02)
+    assert values["run.realtime_factor"] == pytest.approx(
+        values["run.log_s"] / values["run.wall_s"], rel=0.02
+    )
     assert values["odometry.path_length_m"] == pytest.approx(13 * 0.8, rel=0.03)
     assert rows == json.loads((mapped / "said.json").read_text())["metrics"]
 
@@ -61,7 +71,7 @@ def test_metrics_have_name_value_unit_scope_method(mapped: Path) -> None:
 def test_report_is_one_self_contained_file(mapped: Path) -> None:
     page = (mapped / "out/report.html").read_text()
     assert "http://" not in page.replace("http://www.w3.org", "") and "https://" not in page
-    assert "src=\"data:" in page or "<svg" in page
+    assert 'src="data:' in page or "<svg" in page
 
 
 def test_again_runs_no_stage_and_changes_no_byte(mapped: Path) -> None:

@@ -7,7 +7,6 @@ import shutil
 from pathlib import Path
 
 from scanloom.workflows.nightly import run_fleet, with_changes
-
 from tests.logs import scan_folder
 
 
@@ -16,7 +15,9 @@ def test_one_bad_log_of_ten(tmp_path: Path) -> None:
     for i in range(1, 9):
         shutil.copytree(tmp_path / "logs/drive-0", tmp_path / f"logs/drive-{i}")
         (tmp_path / f"logs/drive-{i}/000005.bin").unlink()
-        (tmp_path / f"logs/drive-{i}/{i + 5:06d}.bin").write_bytes((tmp_path / "logs/drive-0/000005.bin").read_bytes())
+        (tmp_path / f"logs/drive-{i}/{i + 5:06d}.bin").write_bytes(
+            (tmp_path / "logs/drive-0/000005.bin").read_bytes()
+        )
     (tmp_path / "logs/drive-9.bag").write_text("no log\n")
     fleet = tmp_path / "fleet.yaml"
     fleet.write_text("each: ['logs/*']\nout: night\n")
@@ -37,7 +38,10 @@ def test_one_bad_log_of_ten(tmp_path: Path) -> None:
 
 
 def test_change_since_last_night() -> None:
-    tonight = [{"map": "a", "metrics": [{"name": "m", "value": 2.0}]}, {"map": "b", "metrics": [{"name": "m", "value": 1.0}]}]
+    tonight = [
+        {"map": "a", "metrics": [{"name": "m", "value": 2.0}]},
+        {"map": "b", "metrics": [{"name": "m", "value": 1.0}]},
+    ]
     before = [{"map": "a", "metrics": [{"name": "m", "value": 1.5}]}]
     rows = with_changes(tonight, before)
     assert rows[0]["metrics"][0]["previous"] == 1.5 and not rows[0]["new"]
