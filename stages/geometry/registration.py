@@ -19,8 +19,8 @@ from scanloom.stages.geometry.voxels import Float, Int, unpack
 
 __all__ = ["Registration", "VoxelMap", "align"]
 
-ROTATION_STEP_RAD = 2e-5
-TRANSLATION_STEP_M = 5e-4
+ROTATION_STEP_RAD = 5e-5
+TRANSLATION_STEP_M = 1e-3
 INNER_STEPS = 3
 SETTLING = 8
 SETTLED = 10.0

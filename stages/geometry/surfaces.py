@@ -25,12 +25,11 @@ def eigen_symmetric_3(a: F8, vectors: F8) -> None:
         off = a[0, 1] ** 2 + a[0, 2] ** 2 + a[1, 2] ** 2
         if off <= _OFF_DIAGONAL * (a[0, 0] ** 2 + a[1, 1] ** 2 + a[2, 2] ** 2):
             break
-        _rotate(a, vectors, 0, 1)
-        _rotate(a, vectors, 0, 2)
-        _rotate(a, vectors, 1, 2)
-    _sort(a, vectors, 0, 1)
-    _sort(a, vectors, 1, 2)
-    _sort(a, vectors, 0, 1)
+        for p in range(2):
+            for q in range(p + 1, 3):
+                _rotate(a, vectors, p, q)
+    for p in range(3):
+        _sort(a, vectors, p % 2)
 
 
 @kernel
@@ -56,7 +55,8 @@ def _rotate(a: F8, vectors: F8, p: Int, q: Int) -> None:
 
 
 @kernel
-def _sort(a: F8, vectors: F8, p: Int, q: Int) -> None:
+def _sort(a: F8, vectors: F8, p: Int) -> None:
+    q = p + 1
     if a[q, q] < a[p, p]:
         a[p, p], a[q, q] = a[q, q], a[p, p]
         for i in range(3):

@@ -25,9 +25,13 @@ MAX_SCALE_ERROR = 0.1
 
 @dataclass(frozen=True)
 class Prediction:
-    """Expected motion since the last scan: pose of the LiDAR now in the LiDAR then, and its covariance (6, 6)."""
+    """Expected motion since the last scan: pose of the LiDAR now in the LiDAR then, and its covariance (6, 6).
+
+    `steady` is the same for a motion that goes on as before, whatever the sensors say: wheels may slip.
+    """
 
     T_last_now: F8
+    steady: F8
     covariance: F8
     known: bool
     """False when neither sensors nor earlier scans tell anything."""
@@ -61,7 +65,8 @@ class Predictor:
         if cover.translation:
             T = self._scaled(T)
         covariance = self._covariance(T, last_ns, now_ns, cover.rotation, cover.translation)
-        return Prediction(T, covariance, self._twist is not None or cover.translation)
+        steady = T if self._twist is None else se3_exp(self._twist * 1e-9 * (now_ns - last_ns))
+        return Prediction(T, steady, covariance, self._twist is not None or cover.translation)
 
     def learn(self, last_ns: int, now_ns: int, T_last_now: F8, *, well_seen: bool) -> None:
         """Take note of the motion that was found; `well_seen`: along every direction by the scan itself."""

@@ -17,6 +17,7 @@ from scanloom.stages.odometry.settings import Settings
 MIN_POINTS = 50
 MIN_INLIERS = 30
 MIN_INLIERS_OF_MATCHES = 0.4
+FADING = 0.9
 MAX_BRIDGED = 10
 
 
@@ -54,8 +55,9 @@ class Tracker:
 
     def step(self, index: int, stamp_ns: int, points: NDArray[np.floating]) -> Row:
         """Take the next scan: points (n, 3) in the LiDAR frame at `stamp_ns`."""
-        fine = points[downsample(points, self.settings.map_spacing_m)].astype(np.float64)
-        coarse = fine[downsample(fine, self.settings.source_voxel_m)]
+        thinned = points[downsample(points, self.settings.map_spacing_m)]
+        fine = thinned.astype(np.float64)
+        coarse = fine[downsample(thinned, self.settings.source_voxel_m)]
         first = self.scans == 0
         self.scans += 1
         if first:
@@ -101,7 +103,7 @@ class Tracker:
             seen, registration.sigma2, inflation=self.settings.covariance_inflation, floor_m=self.settings.floor_m,
             floor_rad=self.settings.floor_rad, predicted=prediction.covariance, least_p=self.settings.least_p,
         )  # fmt: skip
-        reliable = self._credible(registration, len(coarse), T_last_now, prediction)
+        reliable = self._credible(registration, len(coarse), prediction)
         if not reliable:
             covariance = prediction.covariance
         return Found(
@@ -115,10 +117,13 @@ class Tracker:
         )
 
     def _align_from(self, prediction: Prediction, coarse: F8) -> Registration:
-        if prediction.known:
-            return self._align(coarse, self.T @ prediction.T_last_now)
-        tries = [self._align(coarse, self.T @ guess) for guess in self.guesses]
-        return max(tries, key=lambda r: (r.converged, r.inlier_ratio))
+        """From the prediction; where that fails (slip, nothing known yet) the best from other starts."""
+        first = self._align(coarse, self.T @ prediction.T_last_now)
+        if prediction.known and self._credible(first, len(coarse), prediction):
+            return first
+        others = (prediction.steady,) if prediction.known else self.guesses
+        tries = [first, *(self._align(coarse, self.T @ start) for start in others)]
+        return max(tries, key=lambda r: (self._credible(r, len(coarse), prediction), r.inlier_ratio))
 
     def _align(self, coarse: F8, T: F8, free: F8 | None = None) -> Registration:
         scale = float(np.clip(self.deviation.rms_m, self.settings.least_scale_m, self.settings.most_scale_m))
@@ -127,9 +132,7 @@ class Tracker:
             max_iterations=self.settings.max_iterations, free=free,
         )  # fmt: skip
 
-    def _credible(
-        self, registration: Registration, points: int, T_last_now: F8, prediction: Prediction
-    ) -> bool:
+    def _credible(self, registration: Registration, points: int, prediction: Prediction) -> bool:
         """Converged, on enough of the scan, and not further from the prediction than motion can explain."""
         inliers = registration.inlier_ratio * points
         if not registration.converged or registration.inlier_ratio < self.settings.least_inlier_ratio:
@@ -140,7 +143,7 @@ class Tracker:
             return True
         if registration.inlier_ratio < 0.5 * self.inlier_ratio:
             return False
-        correction = se3_log(inverse(prediction.T_last_now) @ T_last_now)
+        correction = se3_log(inverse(self.T @ prediction.T_last_now) @ registration.T_target_source)
         bound_m = max(self.settings.least_bound_m, 5.0 * self.deviation.rms_m)
         too_far = np.linalg.norm(correction[3:]) > bound_m
         return not too_far and bool(np.linalg.norm(correction[:3]) < self.settings.bound_rad)
@@ -155,6 +158,8 @@ class Tracker:
             )
         self.T = orthonormal(self.T @ motion)
         self.last_ns = stamp_ns
+        if not found.reliable:
+            self.inlier_ratio *= FADING
         self.bridged = 0 if found.reliable else self.bridged + 1
 
     def _extend_map(self, fine: F8, reliable: bool) -> None:
