@@ -15,8 +15,10 @@ from scanloom.stages.denoise import denoise
 from scanloom.stages.deskew import Settings, deskew
 from scanloom.stages.geometry.motion import MotionTrack
 from scanloom.stages.geometry.neighbours import ThinScan, twist_between
+from scanloom.stages.geometry.registration import VoxelMap, align
 from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.geometry.sweep import Sweep, sweep_times
+from scanloom.stages.geometry.voxels import downsample
 
 pytestmark = pytest.mark.real
 
@@ -71,3 +73,33 @@ def test_a_real_street_is_deskewed_and_labelled(shared_data: Path) -> None:
         assert 0.4 < share[PointClass.GROUND] < 0.75
         assert share[PointClass.OUTLIER] < 0.03
         assert share[[PointClass.EGO, PointClass.OUT_OF_RANGE]].sum() < 0.01
+
+
+def inertial(folder: Path, scans: range) -> tuple[Imu, Wheel]:
+    """Gyro, and the INS's forward speed in place of wheels."""
+    rows = np.array([np.loadtxt(folder / f"oxts/data/{i:010d}.txt") for i in scans])
+    stamp_ns = 1_600_000_000_000_000_000 + np.array(scans) * PERIOD_NS + PERIOD_NS // 2
+    imu = Imu(stamp_ns, rows[:, 17:20].copy(), rows[:, 11:14].copy())
+    return imu, Wheel(stamp_ns, rows[:, 8].copy(), np.full(len(rows), np.nan))
+
+
+@pytest.mark.parametrize("source", ["sensors", "scans"])
+def test_scans_at_different_turn_rates_fit_each_other_better(shared_data: Path, source: str) -> None:
+    folder = shared_data / DRIVE
+    chosen = range(64, 71)  # the turn rate goes from 0 to -10 deg/s
+    imu, wheel = inertial(folder, range(60, 75))
+    track = MotionTrack.build(imu, wheel, session())
+    scans = [load(folder, i) for i in chosen]
+    told = (imu, wheel) if source == "sensors" else (Imu.empty(), Wheel.empty())
+    flat = [*iter(deskew(Settings(), Scans(scans), session(), *told))]
+    rmse = []
+    for a, b in ((scans[0], scans[-1]), (flat[0], flat[-1])):
+        first, last = a.points().astype(float), b.points().astype(float)
+        target = VoxelMap(1.0, 20)
+        target.insert(first[downsample(first, 0.2)])
+        guess = track.relative(a.reference_ns, b.reference_ns)
+        fit = align(
+            target, last[downsample(last, 0.7)], guess, max_distance_m=1.0, scale_m=0.2, max_iterations=30
+        )
+        rmse.append(fit.rmse_m)
+    assert 0.03 < rmse[1] < 0.9 * rmse[0]
