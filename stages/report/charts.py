@@ -64,7 +64,7 @@ def ticks(high: float) -> list[float]:
 
 def nice_top(high: float) -> float:
     """The upper end of an axis: a round value just above `high`."""
-    high = max(high, 1e-3)
+    high = max(high, 0.01)
     step = ticks(high)[1]
     return float(np.ceil(high / step * 0.9999) * step)
 

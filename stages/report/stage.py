@@ -53,6 +53,9 @@ class Settings(BaseModel):
     ate_warn_m: float = Field(
         1.0, gt=0.0, description="error against truth worth a warning; ten times it fails, m"
     )
+    open_path_warn_m: float = Field(
+        500.0, ge=0.0, description="path without GNSS and without loops worth a warning, m"
+    )
     drift_warn_percent: float = Field(
         2.0, gt=0.0, description="odometry drift worth a warning; five times it fails, %"
     )
@@ -110,7 +113,7 @@ def report(
 def _limits(settings: Settings) -> Limits:
     return Limits(
         settings.unreliable_warn, settings.unreliable_fail, settings.gnss_warn_m, settings.gnss_fail_m,
-        settings.ate_warn_m, settings.drift_warn_percent,
+        settings.ate_warn_m, settings.drift_warn_percent, settings.open_path_warn_m,
     )  # fmt: skip
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -30,6 +30,7 @@ class Limits:
     gnss_fail_m: float
     ate_warn_m: float
     drift_warn_percent: float
+    open_path_warn_m: float
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ def judge(
     limits: Limits, sessions: dict[str, Session], figures: Figures, gnss_median_m: dict[str, float | None]
 ) -> Verdict:
     """Run all checks; the worst of them gives the word."""
-    checks = [*_map_checks(limits, figures, gnss_median_m)]
+    checks = [*_map_checks(limits, sessions, figures)]
     for name, session in sessions.items():
         checks += _session_checks(limits, name, session, figures, gnss_median_m.get(name))
     checks.sort(key=lambda check: _ORDER[check.level])
@@ -57,7 +58,7 @@ def judge(
     return Verdict(_WORDS[worst], worst, checks)
 
 
-def _map_checks(limits: Limits, figures: Figures, gnss_median_m: dict[str, float | None]) -> Iterator[Check]:
+def _map_checks(limits: Limits, sessions: Iterable[str], figures: Figures) -> Iterator[Check]:
     points = figures.get("map.points") or 0
     if not points:
         yield Check("fail", "The map holds no points.")
@@ -75,7 +76,9 @@ def _map_checks(limits: Limits, figures: Figures, gnss_median_m: dict[str, float
             "note", "The map is not georeferenced: no usable GNSS. Coordinates start at the first scan."
         )
     if not georeferenced and not accepted:
-        yield Check("note", "Neither GNSS nor a loop bounds the drift: accuracy falls with distance driven.")
+        path_m = sum(figures.get("fusion.path_length_m", name) or 0.0 for name in sessions)
+        level: Level = "warn" if path_m > limits.open_path_warn_m else "note"
+        yield Check(level, "Neither GNSS nor a loop bounds the drift: accuracy falls with distance driven.")
 
 
 def _session_checks(

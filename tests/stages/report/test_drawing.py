@@ -31,7 +31,7 @@ def test_lengths_are_round(about: float, want: float) -> None:
     assert round_length(about) == pytest.approx(want)
 
 
-@pytest.mark.parametrize("high", [0.003, 0.7, 1.0, 3.9, 12.0, 99.0, 1013.0])
+@pytest.mark.parametrize("high", [0.03, 0.7, 1.0, 3.9, 12.0, 99.0, 1013.0])
 def test_ticks_are_few_and_reach_the_top(high: float) -> None:
     values = ticks(high)
     assert 3 <= len(values) <= 11
