@@ -21,6 +21,7 @@ MAX_CHUNK_BYTES = 1 << 30
 """No recorder writes larger chunks; a file that declares one is damaged or hostile."""
 MAX_MESSAGE_BYTES = 256 << 20
 """No cloud or image is larger."""
+_RELEASE_BYTES = 32 << 20
 
 
 class DamageError(Exception):
@@ -97,7 +98,8 @@ class ChunkedFile:
         self.path = path
         self.damage = Damage()
         self.channels: dict[int, Channel] = {}
-        self._bytes = map_file(path)
+        self._file = MappedFile(path)
+        self._bytes = self._file.view
         self._blocks: list[Block] = []
         self._check_start()
         self._walk()
@@ -112,6 +114,7 @@ class ChunkedFile:
 
     def read(self, channels: set[int]) -> Iterator[RawMessage]:
         """Messages of the channels in order of receive time; at most the chunks that overlap are in memory."""
+        self._file.rewind()
         wanted = [block for block in self._blocks if not channels.isdisjoint(block.stamps)]
         return in_time_order((block.start_ns, partial(self._load, block, channels)) for block in wanted)
 
@@ -147,6 +150,7 @@ class ChunkedFile:
                 )
 
     def _load(self, block: Block, channels: set[int]) -> list[RawMessage]:
+        self._file.passed(block.begin)
         return [message for message in self._messages(block, channels) if message.channel in self.channels]
 
     def _messages(self, block: Block, channels: set[int] | None) -> Iterator[RawMessage]:
@@ -167,12 +171,38 @@ class ChunkedFile:
         return out
 
 
-def map_file(path: Path) -> memoryview:
-    """The file's bytes without reading them; empty for an empty file."""
-    with path.open("rb") as stream:
-        if path.stat().st_size == 0:
-            return memoryview(b"")
-        return memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+class MappedFile:
+    """A file's bytes without reading them; pages that were looked at are given back, so that memory stays flat."""
+
+    def __init__(self, path: Path) -> None:
+        self._map: mmap.mmap | None = None
+        self._released = 0
+        with path.open("rb") as stream:
+            if path.stat().st_size:
+                self._map = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        self.view = memoryview(self._map) if self._map is not None else memoryview(b"")
+
+    def find(self, mark: bytes, start: int) -> int:
+        """Where `mark` next occurs at or after `start`; -1 when it does not."""
+        return -1 if self._map is None else self._map.find(mark, start)
+
+    def passed(self, at: int) -> None:
+        """What lies before `at` is not looked at soon; called often, acts every 32 MiB."""
+        begin = 0 if at < self._released else self._released
+        begin, end = _page(begin), _page(at)
+        if self._map is not None and end - begin >= _RELEASE_BYTES and hasattr(mmap, "MADV_DONTNEED"):
+            self._map.madvise(mmap.MADV_DONTNEED, begin, end - begin)
+            self._released = end
+
+    def rewind(self) -> None:
+        """Reading starts anew from the beginning."""
+        if self._map is not None and hasattr(mmap, "MADV_DONTNEED"):
+            self._map.madvise(mmap.MADV_DONTNEED)
+        self._released = 0
+
+
+def _page(at: int) -> int:
+    return at - at % mmap.PAGESIZE
 
 
 def in_time_order(blocks: Iterable[tuple[int, Callable[[], list[RawMessage]]]]) -> Iterator[RawMessage]:

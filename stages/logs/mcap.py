@@ -7,7 +7,6 @@ times), unless a channel is declared only inside. Source: mcap.dev/spec, version
 
 from __future__ import annotations
 
-import mmap
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -66,6 +65,7 @@ class McapFile(ChunkedFile):
             if op != MESSAGE or run.full:
                 self._blocks += run.take()
             at, ended = end, op == DATA_END
+            self._file.passed(at)
         self._blocks += run.take()
         if not ended and not self.damage:
             self.damage.texts.append(
@@ -101,13 +101,13 @@ class McapFile(ChunkedFile):
         if starts:
             return min(starts)
         for mark in (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4"):
-            found = _find(self._bytes, mark, at + _HEAD.size + 29)
+            found = self._file.find(mark, at + _HEAD.size + 29)
             while found >= 0:
                 start = found - 28 - _HEAD.size
                 op, length = _HEAD.unpack_from(self._bytes, start)
                 if op == CHUNK and start + _HEAD.size + length <= len(self._bytes):
                     return start
-                found = _find(self._bytes, mark, found + 1)
+                found = self._file.find(mark, found + 1)
         return None
 
     def _summary(self) -> list[int]:
@@ -194,12 +194,6 @@ class McapFile(ChunkedFile):
                 self._schema(data[begin:at])
             elif channels is None and op == CHANNEL:
                 self._channel(data[begin:at])
-
-
-def _find(data: memoryview, mark: bytes, start: int) -> int:
-    source = data.obj
-    found: int = source.find(mark, start) if isinstance(source, mmap.mmap) else bytes(data).find(mark, start)
-    return found
 
 
 def _chunk(body: memoryview, begin: int) -> Block:

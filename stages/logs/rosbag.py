@@ -6,7 +6,6 @@ any other. Source: ROS wiki, "Bags/Format/2.0".
 
 from __future__ import annotations
 
-import mmap
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -69,6 +68,7 @@ class Rosbag1File(ChunkedFile):
             if op != MESSAGE or run.full:
                 self._blocks += run.take()
             at = end
+            self._file.passed(at)
         self._blocks += run.take()
         if not self.damage and not 0 < self._index_at <= size:
             self.damage.texts.append(
@@ -93,17 +93,14 @@ class Rosbag1File(ChunkedFile):
 
     def _resume(self, at: int) -> int | None:
         """Where the next whole chunk begins after the damage at `at`."""
-        source = self._bytes.obj
-        if not isinstance(source, mmap.mmap):
-            return None
-        found = source.find(_CHUNK_MARK, at + 1)
+        found = self._file.find(_CHUNK_MARK, at + 1)
         while found >= 0:
             # the mark stands among the fields of a header whose length precedes it, 13 to 60 bytes before
             for start in range(found - 4, max(found - 64, at), -1):
-                (length,) = struct.unpack_from("<I", source, start)
+                (length,) = struct.unpack_from("<I", self._bytes, start)
                 if 8 <= found - start + 4 <= length + 4 <= 120 and self._is_chunk(start):
                     return start
-            found = source.find(_CHUNK_MARK, found + 1)
+            found = self._file.find(_CHUNK_MARK, found + 1)
         return None
 
     def _is_chunk(self, start: int) -> bool:
