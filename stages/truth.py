@@ -22,6 +22,8 @@ VERSION = 1
 # Axes of a camera (x right, y down, z forward) seen from a LiDAR (x forward, y left, z up).
 T_CAMERA_LIDAR = pose(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.zeros(3))
 
+KITTI_WIDTH, TUM_WIDTH = 12, 8
+"""Numbers in a line of KITTI odometry's poses and of a TUM file."""
 _OXTS = re.compile(r"(?P<drive>.*/|)oxts/data/\d+\.txt$")
 
 
@@ -47,8 +49,9 @@ class Settings(BaseModel):
 def truth(settings: Settings, truth_log: TruthLog) -> Truth:
     """The true trajectory of the LiDAR.
 
-    Reads, in this order of preference: the simulator's `trajectory.parquet`, KITTI odometry `poses.txt` with `times.txt`,
-    a TUM file (`stamp tx ty tz qx qy qz qw` a line), KITTI raw OXTS records. No files give no rows.
+    Reads, in this order of preference: the simulator's `trajectory.parquet`; a text file with 12 numbers a line (KITTI
+    odometry's poses, with `times.txt`) or 8 (TUM: `stamp tx ty tz qx qy qz qw`); OXTS records of KITTI raw.
+    No files give no rows.
 
     Raises
     ------
@@ -56,14 +59,16 @@ def truth(settings: Settings, truth_log: TruthLog) -> Truth:
     """
     if not truth_log.names:
         return Truth.empty(source="none")
-    found = (
-        _simulated(truth_log) or _odometry_poses(truth_log) or _tum(settings, truth_log) or _oxts(truth_log)
-    )
+    found = _simulated(truth_log)
+    if found is None:
+        found = _text(settings, truth_log)
+    if found is None:
+        found = _oxts(truth_log)
     if found is None:
         raise InvalidInput(
             f"no trajectory among {', '.join(truth_log.names[:5])}",
             where=str(truth_log.root or ""),
-            next_step="give a TUM file, KITTI poses.txt with times.txt, KITTI oxts, or the simulator's truth folder",
+            next_step="give a TUM file, KITTI poses with times.txt, KITTI oxts, or the simulator's truth folder",
         )
     return _in_order(found, round(settings.time_offset_s * 1e9))
 
@@ -86,57 +91,53 @@ def _simulated(log: TruthLog) -> Truth | None:
     return Truth.open(log.path(name)) if name else None
 
 
-def _odometry_poses(log: TruthLog) -> Truth | None:
-    """`poses.txt`: 12 numbers a line, the left camera in its first frame; `Tr` of calib.txt takes LiDAR to camera."""
-    name = _named(log, "poses.txt")
-    if not name:
-        return None
-    rows = _numbers(log.path(name))
-    if rows.ndim != 2 or rows.shape[1] != 12:
-        raise InvalidInput(
-            "has no 12 numbers a line", where=str(log.path(name)), next_step="give KITTI's poses.txt"
-        )
+def _text(settings: Settings, log: TruthLog) -> Truth | None:
+    """The first text file whose lines are poses."""
+    for name in log.names:
+        if not name.endswith((".txt", ".tum", ".csv")) or "oxts/" in name:
+            continue
+        width = _width(log.path(name))
+        if width == KITTI_WIDTH:
+            return _kitti_poses(log, name)
+        if width == TUM_WIDTH or name.endswith(".tum"):
+            return _tum(settings, log, name)
+    return None
+
+
+def _kitti_poses(log: TruthLog, name: str) -> Truth:
+    """12 numbers a line, the left camera in its first frame; `Tr` of calib.txt takes LiDAR to camera."""
+    rows = _numbers(log.path(name), KITTI_WIDTH)
     times = _named(log, "times.txt")
     stamps = read_seconds(_as_raw(log), times) if times else {}
-    if len(stamps) < len(rows):
+    if not set(range(len(rows))) <= set(stamps):
         raise InvalidInput(
             f"times.txt has {len(stamps)} times for {len(rows)} poses",
             where=str(log.root or ""),
-            next_step="put the sequence's times.txt beside poses.txt",
+            next_step="put the sequence's times.txt beside its poses",
         )
-    T_world_camera = pose(rows.reshape(-1, 3, 4)[:, :, :3], rows.reshape(-1, 3, 4)[:, :, 3])
+    matrices = rows.reshape(-1, 3, 4)
     T_camera_lidar, how = _T_camera_lidar(log)
-    stamp_ns = np.array([stamps[i] for i in range(len(rows))], np.int64)
-    source = (
-        f"KITTI odometry poses.txt ({how}); from RTK GNSS/INS, good to about 0.1 m where reception was good"
-    )
     return Truth(
-        stamp_ns=stamp_ns, T_truth_lidar=_seen_from_lidar(T_world_camera, T_camera_lidar), source=source
+        stamp_ns=np.array([stamps[i] for i in range(len(rows))], np.int64),
+        T_truth_lidar=_seen_from_lidar(pose(matrices[:, :, :3], matrices[:, :, 3]), T_camera_lidar),
+        source=f"KITTI odometry poses ({how}); from RTK GNSS/INS, good to about 0.1 m where reception was good",
     )
 
 
-def _tum(settings: Settings, log: TruthLog) -> Truth | None:
-    name = next((name for name in log.names if _is_tum(log, name)), "")
-    if not name:
-        return None
-    rows = _numbers(log.path(name))
-    if rows.ndim != 2 or rows.shape[1] != 8:
-        raise InvalidInput(
-            "has no 8 numbers a line",
-            where=str(log.path(name)),
-            next_step="give lines of `stamp tx ty tz qx qy qz qw`, stamp in seconds",
-        )
+def _tum(settings: Settings, log: TruthLog, name: str) -> Truth:
+    path = log.path(name)
+    rows = _numbers(path, TUM_WIDTH)
+    if not (np.linalg.norm(rows[:, 4:], axis=1) > 0.1).all():
+        raise InvalidInput("holds a quaternion that is no rotation", where=str(path))
     T = pose(matrix_from_quaternion(rows[:, [7, 4, 5, 6]]), rows[:, 1:4])
-    source = f"TUM file {Path(name).name}; its accuracy is not known here"
+    source = f"TUM file {path.name}; its accuracy is not known here"
     if settings.poses_of == "camera":
         T_camera_lidar, how = _T_camera_lidar(log)
         T, source = _seen_from_lidar(T, T_camera_lidar), f"{source}; poses of a camera, {how}"
     elif settings.poses_of == "sensor":
-        T, source = (
-            T @ np.array(settings.T_sensor_lidar),
-            f"{source}; poses of another sensor, moved to the LiDAR",
-        )
-    return Truth(stamp_ns=_tum_stamps(log.path(name)), T_truth_lidar=T, source=source)
+        T = T @ np.array(settings.T_sensor_lidar)
+        source = f"{source}; poses of another sensor, moved to the LiDAR"
+    return Truth(stamp_ns=_tum_stamps(path), T_truth_lidar=T, source=source)
 
 
 def _oxts(log: TruthLog) -> Truth | None:
@@ -185,33 +186,33 @@ def _seen_from_lidar(T_world_camera: F8, T_camera_lidar: F8) -> F8:
     return inverse(T_camera_lidar) @ T_world_camera @ T_camera_lidar
 
 
-def _is_tum(log: TruthLog, name: str) -> bool:
-    """By suffix, or a text file whose first line of data has eight numbers."""
-    if name.endswith(".tum"):
-        return True
-    if not name.endswith((".txt", ".csv")) or "oxts/" in name:
-        return False
-    with log.path(name).open(errors="replace") as lines:
-        first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
-    try:
-        return len([float(word) for word in first.replace(",", " ").split()]) == 8
-    except ValueError:
-        return False
-
-
 def _lines(path: Path) -> list[list[str]]:
     """Words of every line that is neither blank nor a comment."""
     lines = path.read_text(errors="replace").replace(",", " ").splitlines()
     return [line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")]
 
 
-def _numbers(path: Path) -> F8:
+def _width(path: Path) -> int:
+    """How many numbers the first line of data has; 0 when it holds anything else."""
+    with path.open(errors="replace") as lines:
+        first = next((line for line in lines if line.strip() and not line.lstrip().startswith("#")), "")
+    try:
+        return len([float(word) for word in first.replace(",", " ").split()])
+    except ValueError:
+        return 0
+
+
+def _numbers(path: Path, width: int) -> F8:
     try:
         rows = np.array(_lines(path), float)
     except ValueError as error:
         raise InvalidInput(f"holds a line that is no pose: {error}", where=str(path)) from error
-    if len(rows) == 0 or not np.isfinite(rows).all():
-        raise InvalidInput("holds no poses, or some that are not finite", where=str(path))
+    if rows.ndim != 2 or rows.shape[1] != width or not np.isfinite(rows).all():
+        raise InvalidInput(
+            f"has lines without {width} finite numbers",
+            where=str(path),
+            next_step="give lines of `stamp tx ty tz qx qy qz qw`, stamp in seconds, or KITTI's poses",
+        )
     return rows
 
 
