@@ -23,6 +23,8 @@ I8 = NDArray[np.int64]
 F4 = NDArray[np.float32]
 
 LEAST_COMMON_COLUMNS = 12
+BESIDE_M = np.array([-4.0, -2.0, 2.0, 4.0])
+NEIGHBOURHOOD_MARGIN = 0.05
 TAU = 2 * np.pi
 
 
@@ -52,8 +54,11 @@ class CandidateSettings(BaseModel):
     spacing_m: float = Field(
         default=10.0, gt=0, le=1000, description="no two candidates are closer than this on both passes, m"
     )
-    max_candidates: int = Field(
-        default=400, ge=1, le=100000, description="most candidates that are verified, the best first"
+    per_km: float = Field(
+        default=100.0,
+        gt=0,
+        le=1e4,
+        description="candidates verified per kilometre driven, the best first, at least 20",
     )
 
 
@@ -122,10 +127,12 @@ def candidates(settings: CandidateSettings, tracks: Sequence[Track]) -> list[Can
     """The most promising candidates of all sessions, thinned along the tracks, best first."""
     found = _by_position(settings, tracks) + _by_descriptor(settings, tracks)
     found.sort(key=lambda c: (c.score, c.b, c.j, c.a, c.i))
+    driven_m = sum(float(t.travelled_m[-1] - t.travelled_m[0]) for t in tracks if len(t))
+    most = max(20, int(settings.per_km * driven_m / 1000.0))
     kept: list[Candidate] = []
     taken: dict[tuple[int, int, int, int], list[tuple[float, float]]] = {}
     for c in found:
-        if len(kept) == settings.max_candidates:
+        if len(kept) == most:
             break
         s_i, s_j = float(tracks[c.a].travelled_m[c.i]), float(tracks[c.b].travelled_m[c.j])
         if not _crowded(taken, c, s_i, s_j, settings.spacing_m):
@@ -213,12 +220,31 @@ def _by_descriptor(settings: CandidateSettings, tracks: Sequence[Track]) -> list
                 settings.neighbours,
             )  # fmt: skip
             for k in np.flatnonzero((best >= 0) & (distance <= settings.max_descriptor_distance)):
+                i, j = int(best[k]), int(queries[k])
+                around = _neighbourhood_distance(units[a], units[b], _beside(tracks[a], i), _beside(track, j))
+                if around > settings.max_descriptor_distance + NEIGHBOURHOOD_MARGIN:
+                    continue
                 yaw = float((shift[k] / track.descriptor.shape[2] * TAU + np.pi) % TAU - np.pi)
-                score = float(distance[k]) / settings.max_descriptor_distance
-                found.append(
-                    _ordered(tracks, a, int(best[k]), b, int(queries[k]), float(distance[k]), yaw, score)
-                )
+                score = 0.5 * (float(distance[k]) + around) / settings.max_descriptor_distance
+                found.append(_ordered(tracks, a, i, b, j, float(distance[k]), yaw, score))
     return found
+
+
+def _beside(track: Track, k: int) -> I8:
+    """Keyframes (4,) nearest to 4 and 2 m before and 2 and 4 m after keyframe k."""
+    wanted = track.travelled_m[k] + BESIDE_M
+    after = np.clip(np.searchsorted(track.travelled_m, wanted), 0, len(track) - 1)
+    return np.asarray(after, np.int64)
+
+
+def _neighbourhood_distance(units_a: F4, units_b: F4, beside_i: I8, beside_j: I8) -> float:
+    """Mean distance of the neighbours of i and j, driven in the same or in the opposite direction (STV-SC's temporal check).
+
+    A place that looks alike by accident has neighbours that do not.
+    """
+    same = [_distance(units_a[i], units_b[j])[0] for i, j in zip(beside_i, beside_j, strict=True)]
+    opposite = [_distance(units_a[i], units_b[j])[0] for i, j in zip(beside_i[::-1], beside_j, strict=True)]
+    return float(min(np.mean(same), np.mean(opposite)))
 
 
 def _unit_columns(descriptor: F4) -> F4:
