@@ -5,6 +5,7 @@ Ingest and inspect both feed it, so that what inspect says is what ingest finds.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from scanloom.schemas.session import Extrinsic, Problem, Session, Topic
 from scanloom.schemas.tracks import Gnss, Imu, Wheel
+from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.logs.checks import GRAVITY_M_S2, gnss_problems, imu_problems, stamp_problems
 from scanloom.stages.logs.mounting import TfTree, resolve
 from scanloom.stages.logs.options import Settings
@@ -39,8 +41,8 @@ _MOST_SHOWN = 4
 class _Track:
     """Stamps of one topic in the order of the log."""
 
-    header_ns: list[int] = field(default_factory=list)
-    receive_ns: list[int] = field(default_factory=list)
+    header_ns: array[int] = field(default_factory=lambda: array("q"))
+    receive_ns: array[int] = field(default_factory=lambda: array("q"))
     broken: int = 0
     broken_reason: str = ""
     frame: str = ""
@@ -62,9 +64,10 @@ class Survey:
         self.tf = TfTree()
         self.tracks = {role: _Track() for role in ROLES}
         self._role = roles.used()
-        self._imu: list[ImuSample] = []
-        self._gnss: list[GnssSample] = []
-        self._wheel: list[WheelSample] = []
+        # plain doubles, row by row: an hour of IMU as objects would be hundreds of megabytes
+        self._imu: array[float] = array("d")
+        self._gnss: array[float] = array("d")
+        self._wheel: array[float] = array("d")
 
     @property
     def topics(self) -> set[str]:
@@ -96,55 +99,56 @@ class Survey:
 
     def _keep(self, body: object) -> None:
         if isinstance(body, ImuSample):
-            self._imu.append(body)
+            self._imu.extend((*body.gyro_rad_s, *body.accel_m_s2))
         elif isinstance(body, GnssSample):
-            self._gnss.append(body)
+            position = (body.latitude_deg, body.longitude_deg, body.height_m)
+            state = (body.status, body.satellites, body.covariance_known)
+            self._gnss.extend((*position, *state, *body.covariance_m2))
         elif isinstance(body, WheelSample):
-            self._wheel.append(body)
+            self._wheel.extend((body.speed_m_s, body.yaw_rate_rad_s))
 
     # -- products -----------------------------------------------------------------------------------------------------
 
     def imu(self) -> Imu:
         """All IMU samples in order of time, in SI units."""
         rows = self._ordered("imu")
-        accel = np.array([s.accel_m_s2 for s in self._imu], float).reshape(-1, 3)[rows]
-        gyro = np.array([s.gyro_rad_s for s in self._imu], float).reshape(-1, 3)[rows]
+        values = _table(self._imu, 6)[rows]
         scale = GRAVITY_M_S2 if self._in_g() else 1.0
-        return Imu(stamp_ns=self._stamps("imu")[rows], gyro_rad_s=gyro, accel_m_s2=accel * scale)
+        return Imu(
+            stamp_ns=self._stamps("imu")[rows],
+            gyro_rad_s=values[:, :3].copy(),
+            accel_m_s2=values[:, 3:] * scale,
+        )
 
     def _in_g(self) -> bool:
         """Some IMUs (Livox, for one) give acceleration in units of gravity."""
-        accel = np.array([s.accel_m_s2 for s in self._imu], float).reshape(-1, 3)
+        accel = _table(self._imu, 6)[:, 3:]
         return bool(len(accel) and 0.8 < np.linalg.norm(np.median(accel, axis=0)) < 1.2)
 
     def gnss(self) -> Gnss:
         """All fixes in order of time; position NaN where there is none."""
         rows = self._ordered("gnss")
-        values = np.array([(s.latitude_deg, s.longitude_deg, s.height_m) for s in self._gnss], float).reshape(
-            -1, 3
-        )
-        status = np.array([s.status for s in self._gnss], np.int8)
+        values = _table(self._gnss, 15)[rows].copy()
+        position, status = values[:, :3], values[:, 3]
         # receivers without fix send zeros
-        lost = (status < 0) | ~np.isfinite(values[:, :2]).all(axis=1) | ~values[:, :2].any(axis=1)
-        values[lost] = np.nan
+        lost = (status < 0) | ~np.isfinite(position[:, :2]).all(axis=1) | ~position[:, :2].any(axis=1)
+        position[lost] = np.nan
         status[lost] = -1
-        covariance = np.array([s.covariance_m2 for s in self._gnss], float).reshape(-1, 3, 3)
-        known = np.array([s.covariance_known for s in self._gnss], bool)
-        covariance[~known] = 0.0
+        values[values[:, 5] == 0, 6:] = 0.0
         return Gnss(
             stamp_ns=self._stamps("gnss")[rows],
-            latitude_deg=values[rows, 0],
-            longitude_deg=values[rows, 1],
-            height_m=values[rows, 2],
-            covariance_m2=covariance[rows],
-            status=status[rows],
-            satellites=np.array([s.satellites for s in self._gnss], np.int16)[rows],
+            latitude_deg=position[:, 0].copy(),
+            longitude_deg=position[:, 1].copy(),
+            height_m=position[:, 2].copy(),
+            covariance_m2=values[:, 6:].reshape(-1, 3, 3).copy(),
+            status=status.astype(np.int8),
+            satellites=values[:, 4].astype(np.int16),
         )
 
     def wheel(self) -> Wheel:
         """All wheel speeds in order of time."""
         rows = self._ordered("wheel")
-        values = np.array([(s.speed_m_s, s.yaw_rate_rad_s) for s in self._wheel], float).reshape(-1, 2)[rows]
+        values = _table(self._wheel, 2)[rows]
         return Wheel(
             stamp_ns=self._stamps("wheel")[rows],
             speed_m_s=values[:, 0].copy(),
@@ -279,6 +283,10 @@ class Survey:
             )
             for topic in self.source.topics
         )
+
+
+def _table(values: array[float], width: int) -> F8:
+    return np.array(values, np.float64).reshape(-1, width)
 
 
 TopicRole = Literal["lidar", "imu", "gnss", "wheel", "images", "tf", "unused"]
