@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import heapq
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,10 +31,11 @@ class BagLog:
 
     format: str
     files: list[Container]
-    problems: tuple[Problem, ...] = ()
     extrinsics: tuple[Extrinsic, ...] = ()
     topics: tuple[TopicInfo, ...] = ()
     opening: Damage = field(default_factory=Damage)
+    unstamped: Counter[str] = field(default_factory=Counter)
+    """Messages per topic whose header has no stamp; they get their receive time."""
 
     def __post_init__(self) -> None:
         self.files.sort(key=lambda file: _range(file)[0])
@@ -48,8 +50,22 @@ class BagLog:
             total.texts += [f"{file.path.name}: {text}" for text in file.damage.texts]
         return total
 
+    @property
+    def problems(self) -> tuple[Problem, ...]:
+        """What reading found odd so far."""
+        return tuple(
+            Problem(
+                code="log.unstamped",
+                severity="warning",
+                text=f"{count} messages of {topic} have no stamp in their header; they get the time of recording.",
+                topic=topic,
+            )
+            for topic, count in sorted(self.unstamped.items())
+        )
+
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Decoded messages of the topics in order of receive time."""
+        self.unstamped.clear()
         for group in _groups(self.files):
             streams = [self._decoded(file, topics) for file in group]
             merged = streams[0] if len(streams) == 1 else heapq.merge(*streams, key=_receive_ns)
@@ -68,6 +84,9 @@ class BagLog:
         for raw in file.read(wanted):
             channel = channels[raw.channel]
             body = decode(raw.data, channel.type, channel.encoding, channel.topic, raw.receive_ns)
+            if body.stamp_ns == 0 and raw.receive_ns:
+                self.unstamped[channel.topic] += 1
+                body = replace(body, stamp_ns=raw.receive_ns)
             yield raw.receive_ns, Message(channel.topic, body)
 
 

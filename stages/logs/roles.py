@@ -166,6 +166,9 @@ def no_lidar(source: LogSource, where: str) -> InvalidInput:
     if packets:
         found.insert(0, f"raw packets of a LiDAR driver ({packets[0]}), which are not decoded")
     holds = _sentence(found) if found else f"{len(source.topics)} topics, none of a kind that is known"
+    unreadable = [t for t in source.topics if t.remark and t.count]
+    if unreadable:
+        holds += f", and {len(unreadable)} topics in another encoding ({unreadable[0].name}: {unreadable[0].remark})"
     if source.damage:
         return InvalidInput(
             f"The log is damaged, and what can be read of it has no point cloud: {'; '.join(source.damage.texts[:3])}.",

@@ -5,6 +5,7 @@ Ingest and inspect both feed it, so that what inspect says is what ingest finds.
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -92,6 +93,10 @@ class Survey:
         if isinstance(body, Undecodable):
             track.broken += 1
             track.broken_reason = track.broken_reason or body.reason
+            return
+        if not _finite(body):
+            track.broken += 1
+            track.broken_reason = track.broken_reason or "values are not finite"
             return
         self._keep(body)
         track.add(body.stamp_ns, body.receive_ns)
@@ -235,7 +240,7 @@ class Survey:
             )
             yield from stamp_problems(role, topic, header, np.array(track.receive_ns, np.int64), start)
             if track.broken:
-                text = f"{track.broken} messages of {topic} do not fit their type ({track.broken_reason}) and are left out."
+                text = f"{track.broken} messages of {topic} cannot be used ({track.broken_reason}) and are left out."
                 yield Problem(code=f"{role}.broken", severity="warning", text=text, topic=topic)
             if shift := self._shift_ns(role):
                 text = (
@@ -283,6 +288,13 @@ class Survey:
             )
             for topic in self.source.topics
         )
+
+
+def _finite(body: object) -> bool:
+    """Whether an IMU or wheel sample is a number; a missing yaw rate is none."""
+    if isinstance(body, ImuSample):
+        return all(map(math.isfinite, (*body.gyro_rad_s, *body.accel_m_s2)))
+    return not isinstance(body, WheelSample) or math.isfinite(body.speed_m_s)
 
 
 def _table(values: array[float], width: int) -> F8:

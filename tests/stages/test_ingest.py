@@ -246,6 +246,38 @@ def test_acceleration_in_units_of_gravity_is_converted(tmp_path: Path) -> None:
     assert "imu.units_g" in result.codes()
 
 
+def test_what_is_no_number_and_what_has_no_stamp_is_said(tmp_path: Path) -> None:
+    items = list(drive(ROS2))
+    for i, item in enumerate(items):
+        if item.topic == "/imu" and i % 7 == 0:
+            items[i] = Item(
+                item.topic, item.type, item.receive_ns, writing.imu(ROS2, item.receive_ns, (0, 0, np.nan))
+            )
+        if item.topic == "/odom":
+            items[i] = Item(item.topic, item.type, item.receive_ns, writing.odometry(ROS2, 0))
+    result = run(recorded(tmp_path, items))
+    assert {"imu.broken", "log.unstamped"} <= result.codes()
+    assert 30 < len(result.imu) < 50
+    assert np.isfinite(result.imu.accel_m_s2).all()
+    assert result.wheel.stamp_ns[0] == START_NS + 2_000_000
+    assert len(result.wheel) == 10
+
+
+def test_other_encodings_are_named(tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    with (tmp_path / "a.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        channel = writer.register_channel(
+            "/points", "protobuf", writer.register_schema("foxglove.PointCloud", "protobuf", b"")
+        )
+        writer.add_message(channel, 1, b"123", 1)
+        writer.finish()
+    with pytest.raises(InvalidInput, match=r"/points: encoding 'protobuf' cannot be read"):
+        run(tmp_path / "a.mcap")
+
+
 def test_the_name_does_not_depend_on_where_the_log_lies(tmp_path: Path) -> None:
     results = []
     for folder in ("here", "there"):
