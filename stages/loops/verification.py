@@ -7,7 +7,8 @@ fit anywhere along it), agreement of the registration in both directions, and pl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +61,9 @@ class VerificationSettings(BaseModel):
     min_contrast: float = Field(
         default=0.2, ge=0, le=1, description="a copy displaced by 1.5 m must lose this share of inliers"
     )
+    max_rival: float = Field(
+        default=0.85, ge=0, le=1, description="fit of the second-best pose over that of the best, at most"
+    )
     max_seen_through: float = Field(
         default=0.04,
         ge=0,
@@ -111,8 +115,33 @@ def verify(settings: VerificationSettings, c: Candidate, path_m: float, i: Subma
         return _rejected("nothing upright to compare")
     maps = _Maps(i)
     tried = [_refine(maps, j, h) for h in proposals]
-    best = max(tried, key=lambda r: r.inlier_ratio if r.converged else 0.0)
-    return _judge(settings, c, path_m, i, j, maps, best)
+    fits = [_upright_fit(settings, maps, j, r) for r in tried]
+    best = int(np.argmax(fits))
+    verdict = _judge(settings, c, path_m, i, j, maps, tried[best])
+    if not verdict.reason:
+        verdict = replace(verdict, reason=_ambiguous(settings, tried, fits, best))
+    return verdict
+
+
+def _upright_fit(settings: VerificationSettings, maps: _Maps, j: Submap, r: Registration) -> float:
+    """Share of the upright points of j that find a partner."""
+    upright = _upright(j)
+    thin = upright[downsample(upright, 0.8)]
+    if not r.converged or not len(thin):
+        return 0.0
+    return float(_inliers(maps.fine, transform(r.T_target_source, thin), settings.inlier_distance_m).mean())
+
+
+def _ambiguous(
+    settings: VerificationSettings, tried: Sequence[Registration], fits: Sequence[float], best: int
+) -> str:
+    """A second pose that fits nearly as well: the place repeats itself."""
+    for r, fit in zip(tried, fits, strict=True):
+        apart = se3_log(inverse(tried[best].T_target_source) @ r.T_target_source)
+        other = np.linalg.norm(apart[3:]) > 1.0 or np.linalg.norm(apart[:3]) > np.radians(5.0)
+        if other and fit > settings.max_rival * fits[best]:
+            return f"ambiguous: another pose {np.linalg.norm(apart[3:]):.1f} m away fits {fit:.0%} against {fits[best]:.0%}"
+    return ""
 
 
 def _rejected(reason: str) -> Verdict:

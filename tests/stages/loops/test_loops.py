@@ -137,6 +137,22 @@ def test_a_tunnel_looks_the_same_everywhere() -> None:
     assert found.accepted.sum() == 0
 
 
+def test_a_street_that_repeats_itself_is_ambiguous() -> None:
+    boxes = []
+    for x in np.arange(-130, 130, 10.0):
+        for side in (-1, 1):
+            y = sorted((side * 9.0, side * 16.0))
+            boxes.append([[x, y[0], GROUND_Z_M], [x + 6.0, y[1], 5.0]])
+    scans, T = passes(
+        BoxWorld(np.array(boxes)), [polyline([(-20, 0), (20, 0)]), polyline([(-20, 0.4), (20, 0.4)])]
+    )
+    drift = np.eye(4)
+    drift[0, 3] = 5.5
+    found = close(scans, T, drift)
+    assert len(found) > 0
+    assert found.accepted.sum() == 0
+
+
 def test_other_sessions_are_searched_by_looks() -> None:
     world = block(1)
     T_a, T_b = polyline([(SIDE, 24), (SIDE, -24)]), polyline([(SIDE + 2.5, -20), (SIDE + 2.5, 20)])
