@@ -295,6 +295,7 @@ def fit_surface(
 
 MIN_NEIGHBOURS = 6
 SURFACE_NOISE2 = 0.05**2
+LEAST_WIDTH2 = 0.1**2
 
 
 @kernel
@@ -302,8 +303,9 @@ def shape_weight(small: Float, middle: Float, large: Float, n: Int) -> Float:
     """Weight of a residual along the normal, from the eigenvalues (m2) of the n points around.
 
     1 on a clean plane and falling with its roughness; 0 where the points are too few or form a line, since a line of
-    returns on a plane (one beam's ring) says nothing about the direction across it.
+    returns on a plane (one beam's ring) says nothing about the direction across it: range noise widens the ring along
+    the beam, and the plane fitted to it would be that of the beam.
     """
-    if n < MIN_NEIGHBOURS or middle < 0.005 * large or small > 0.2 * middle:
+    if n < MIN_NEIGHBOURS or middle < max(0.02 * large, LEAST_WIDTH2) or small > 0.2 * middle:
         return 0.0
     return SURFACE_NOISE2 / (SURFACE_NOISE2 + max(small, 0.0))
