@@ -31,7 +31,7 @@ I8 = NDArray[np.int64]
 
 MAX_GYRO_RAD_S = 35.0  # 2000 deg/s, the range of the fastest common gyros
 MAX_SPEED_M_S = 100.0
-STILL_SPEED_M_S = 0.02
+CREEP_M_S, STILL_SPEED_M_S = 0.15, 0.02
 STILL_GYRO_STD_RAD_S = 0.02
 STILL_ACCEL_STD_M_S2 = 0.25
 MAX_BIAS_RAD_S = 0.05
@@ -206,7 +206,7 @@ def standstill_intervals(
     By the wheels where there are any; else by an IMU that shakes as little as one at rest and hardly turns.
     """
     if len(wheel_ns) > 1:
-        return _runs(wheel_ns, np.abs(speed_m_s) < STILL_SPEED_M_S, round(least_s * 1e9))
+        return _runs(wheel_ns, _standing(wheel_ns, speed_m_s), round(least_s * 1e9))
     if len(imu_ns) < LEAST_SAMPLES:
         return NOTHING
     second = (imu_ns - imu_ns[0]) // round(least_s * 1e9)
@@ -252,6 +252,14 @@ def gravity_points_up(accel: F8, T_base_imu: F8) -> bool:
     up = T_base_imu[:3, :3] @ np.median(known, axis=0)
     norm = float(np.linalg.norm(up))
     return norm < 5.0 or up[2] > norm * np.cos(MAX_MEAN_TILT_RAD)
+
+
+def _standing(wheel_ns: I8, speed_m_s: F8) -> NDArray[np.bool_]:
+    """Where the speed is nothing but noise: small, and smaller yet in the mean over half a second."""
+    period_ns = max(float(np.median(np.diff(wheel_ns))), 1.0)
+    window = int(np.clip(round(0.5e9 / period_ns), 1, len(wheel_ns)))
+    mean = np.convolve(speed_m_s, np.full(window, 1.0 / window), mode="same")
+    return (np.abs(speed_m_s) < CREEP_M_S) & (np.abs(mean) < STILL_SPEED_M_S)
 
 
 def _runs(stamp_ns: I8, holds: NDArray[np.bool_], least_ns: int) -> I8:

@@ -38,10 +38,10 @@ def make_session(point_time: str = "per point", mounted: bool = False) -> Sessio
 
 
 def sensors(
-    twist_base: F8, *, bias: F8 = BIAS, T_base_imu: F8 = T_BASE_IMU, rng_seed: int = 3
+    twist_base: F8, *, bias: F8 = BIAS, T_base_imu: F8 = T_BASE_IMU, wheel_noise: float = 0.0
 ) -> tuple[Imu, Wheel]:
     """Five seconds of standing, then the twist of the base; 100 Hz IMU, 50 Hz wheel."""
-    rng = np.random.default_rng(rng_seed)
+    rng = np.random.default_rng(3)
     imu_ns = START_NS + np.arange(-520, 300) * 10_000_000
     wheel_ns = START_NS + np.arange(-260, 150) * 20_000_000
     moves = (imu_ns > START_NS - 200_000_000)[:, None]
@@ -52,6 +52,7 @@ def sensors(
     )
     accel = np.tile(GRAVITY @ T_base_imu[:3, :3], (len(imu_ns), 1)) + rng.normal(0, 0.02, (len(imu_ns), 3))
     speed = np.where(wheel_ns > START_NS - 200_000_000, twist_base[3], 0.0)
+    speed = speed + rng.normal(0, wheel_noise, len(speed))
     return Imu(imu_ns, gyro, accel), Wheel(wheel_ns, speed, np.full(len(wheel_ns), np.nan))
 
 
@@ -242,9 +243,10 @@ def test_scans_stream_one_by_one_and_the_same_input_gives_the_same_bytes() -> No
     assert [s.scan_index for s in first] == [0, 1, 2, 3]
 
 
-def test_track_bias_standstill_and_relative_motion() -> None:
+@pytest.mark.parametrize("wheel_noise", [0.0, 0.02])
+def test_track_bias_standstill_and_relative_motion(wheel_noise: float) -> None:
     base = np.array([0, 0, np.radians(30), 20.0, 0, 0])
-    imu, wheel = sensors(base)
+    imu, wheel = sensors(base, wheel_noise=wheel_noise)
     track = MotionTrack.build(imu, wheel, make_session(mounted=True))
     assert track.has_rotation
     assert track.has_translation
