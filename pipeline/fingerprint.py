@@ -154,7 +154,15 @@ def _module_source(name: str) -> tuple[Path, str]:
     if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
         raise UsageError(f"the source of module {name} cannot be found", next_step="declare stages in a file")
     path = Path(spec.origin)
-    return path, file_digest(path)[:16]
+    return path, _source_digest(path)
+
+
+def _source_digest(path: Path) -> str:
+    """Digest of a module; a package's covers the templates beside it, which its modules read as they do code."""
+    templates = sorted(path.parent.glob("*.html")) if path.name == "__init__.py" else []
+    if not templates:
+        return file_digest(path)[:16]
+    return files_digest({file.name: file_digest(file) for file in (path, *templates)})[:16]
 
 
 @cache

@@ -57,6 +57,16 @@ def fingerprint(plant: Path) -> dict:
     return eval(done.stdout)
 
 
+def test_templates_count_with_their_package(plant):
+    before = fingerprint(plant)
+    (plant / "tools" / "page.html").write_text("<p>")
+    first = fingerprint(plant)
+    (plant / "tools" / "page.html").write_text("<b>")
+    second = fingerprint(plant)
+    assert len({digest(found) for found in (before, first, second)}) == 3
+    assert first["modules"]["plant.tools.near"] == before["modules"]["plant.tools.near"]
+
+
 def test_closure_of_imports(plant):
     found = fingerprint(plant)
     names = ["plant", "plant.late", "plant.stage", "plant.tools", "plant.tools.deep", "plant.tools.near"]
