@@ -142,7 +142,11 @@ class Table(Product):
         return cls(**arrays, **attributes)
 
     def write(self, path: Path) -> int:
-        with pq.ParquetWriter(path, arrow_schema(type(self)), **_writer_options(type(self))) as writer:
+        return self.write_to(path)
+
+    def write_to(self, sink: Path | IO[bytes]) -> int:
+        """As `write`, also into an open file."""
+        with pq.ParquetWriter(sink, arrow_schema(type(self)), **_writer_options(type(self))) as writer:
             writer.write_table(self.to_arrow(), row_group_size=max(len(self), 1))
             writer.add_key_value_metadata({FOOTER_KEY: _footer(type(self), self.attributes)})
         return len(self)
@@ -194,8 +198,12 @@ class Stream(Product, Generic[ItemT]):
         raise ProductError(f"{type(self).__name__} is still a generator and cannot be indexed")
 
     def write(self, path: Path) -> int:
+        return self.write_to(path)
+
+    def write_to(self, sink: Path | IO[bytes]) -> int:
+        """As `write`, also into an open file."""
         index: list[dict[str, Any]] = []
-        with pq.ParquetWriter(path, arrow_schema(self.ITEM), **_writer_options(self.ITEM)) as writer:
+        with pq.ParquetWriter(sink, arrow_schema(self.ITEM), **_writer_options(self.ITEM)) as writer:
             for item in self._items:
                 writer.write_table(item.to_arrow(), row_group_size=max(len(item), 1))
                 index.append({**item.attributes, "rows": len(item)})

@@ -84,3 +84,21 @@ class Labels(Stream[ScanLabels]):
 
     NAME = "labels"
     ITEM = ScanLabels
+
+
+@dataclass(frozen=True)
+class TrueLabels(Table):
+    """What every point of one simulated scan truly is, in the order of the message; for evaluation and tests only."""
+
+    NAME: ClassVar[str] = "true_labels"
+
+    class_: NDArray[np.uint8] = column("u1", "a value of PointClass")
+    instance: NDArray[np.uint16] = column("u2", "number of the object, 0 for none")
+    scan_index: int = attribute("number of the scan in its session, from 0")
+
+
+class TruePoints(Stream[TrueLabels]):
+    """The true labels of a simulated session."""
+
+    NAME = "true_points"
+    ITEM = TrueLabels

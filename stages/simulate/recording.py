@@ -1,0 +1,199 @@
+"""The log a vehicle would have recorded: a rosbag2 folder with one MCAP file, messages in the order they were received."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cache
+from typing import IO, Any
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from scanloom.stages.geometry.se3 import F8, quaternion_from_matrix
+from scanloom.stages.simulate.rig import T_BASE
+from scanloom.stages.simulate.sweeping import Sweep
+from scanloom.stages.simulate.tracks import GnssTrack, ImuTrack, WheelTrack
+
+LOG_FILE = "sample_0.mcap"
+LIDAR, IMU, WHEEL, GNSS, TF = "/lidar/points", "/imu/data", "/wheel/twist", "/gnss/fix", "/tf_static"
+TYPES = {
+    TF: "tf2_msgs/msg/TFMessage",
+    LIDAR: "sensor_msgs/msg/PointCloud2",
+    IMU: "sensor_msgs/msg/Imu",
+    WHEEL: "geometry_msgs/msg/TwistWithCovarianceStamped",
+    GNSS: "sensor_msgs/msg/NavSatFix",
+}
+DELAY_NS = {LIDAR: 4_000_000, IMU: 700_000, WHEEL: 1_900_000, GNSS: 38_000_000, TF: 0}
+"""From measurement to recorder."""
+POINT = np.dtype(
+    {
+        "names": ["x", "y", "z", "intensity", "ring", "time"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "<u2", "<f4"],
+        "offsets": [0, 4, 8, 12, 16, 18],
+        "itemsize": 22,
+    }
+)
+"""As velodyne_pointcloud lays points out; `time` is seconds after the header's stamp."""
+
+Entry = tuple[int, str, int, bytes]
+"""Receive time ns, topic, header time ns, serialised message."""
+
+
+@cache
+def _types() -> Any:
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def _class(name: str) -> Any:
+    return _types().types[name]
+
+
+@dataclass
+class Recorder:
+    """Writes the log, and counts what it writes for `metadata.yaml`."""
+
+    counts: dict[str, int] = field(default_factory=dict)
+    first_ns: int = 0
+    last_ns: int = 0
+
+    def record(self, stream: IO[bytes], entries: Iterator[Entry]) -> None:
+        """Write all messages; same entries, same bytes."""
+        writer = Writer(stream, compression=CompressionType.ZSTD, chunk_size=4 << 20)
+        writer.start(profile="ros2", library="scanloom")
+        channels = {topic: self._channel(writer, topic) for topic in TYPES}
+        self.counts = dict.fromkeys(TYPES, 0)
+        for receive_ns, topic, header_ns, data in entries:
+            writer.add_message(channels[topic], receive_ns, data, header_ns, self.counts[topic])
+            self.first_ns = self.first_ns or receive_ns
+            self.last_ns = receive_ns
+            self.counts[topic] += 1
+        writer.finish()
+
+    def _channel(self, writer: Writer, topic: str) -> int:
+        text, _ = _types().generate_msgdef(TYPES[topic], ros_version=2)
+        schema = writer.register_schema(TYPES[topic], "ros2msg", text.encode())
+        durability = "transient_local" if topic == TF else "volatile"
+        profile = f"- history: keep_last\n  depth: 10\n  reliability: reliable\n  durability: {durability}\n"
+        return int(writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": profile}))
+
+    def metadata(self) -> bytes:
+        """`metadata.yaml` of the folder, rosbag2 version 5."""
+        duration = self.last_ns - self.first_ns
+        lines = [
+            "rosbag2_bagfile_information:",
+            "  version: 5",
+            "  storage_identifier: mcap",
+            f"  duration: {{nanoseconds: {duration}}}",
+            f"  starting_time: {{nanoseconds_since_epoch: {self.first_ns}}}",
+            f"  message_count: {sum(self.counts.values())}",
+            "  topics_with_message_count:",
+        ]
+        for topic, count in self.counts.items():
+            meta = f"{{name: {topic}, type: {TYPES[topic]}, serialization_format: cdr, offered_qos_profiles: ''}}"
+            lines += [f"    - topic_metadata: {meta}", f"      message_count: {count}"]
+        lines += [
+            "  compression_format: ''",
+            "  compression_mode: ''",
+            f"  relative_file_paths: [{LOG_FILE}]",
+            "  files:",
+            f"    - path: {LOG_FILE}",
+            f"      starting_time: {{nanoseconds_since_epoch: {self.first_ns}}}",
+            f"      duration: {{nanoseconds: {duration}}}",
+            f"      message_count: {sum(self.counts.values())}",
+        ]
+        return ("\n".join(lines) + "\n").encode()
+
+
+def entries(
+    start_ns: int, sweeps: Iterator[Sweep], imu: ImuTrack, wheel: WheelTrack, gnss: GnssTrack
+) -> Iterator[Entry]:
+    """All messages in the order of their reception."""
+    streams = (_tf(start_ns), _clouds(sweeps), _imu(imu), _wheel(wheel), _gnss(gnss))
+    return heapq.merge(*streams, key=lambda entry: entry[0])
+
+
+def _clouds(sweeps: Iterator[Sweep]) -> Iterator[Entry]:
+    for sweep in sweeps:
+        last_ns = sweep.start_ns + int(float(sweep.time_s[-1]) * 1e9 if len(sweep.time_s) else 0)
+        yield last_ns + DELAY_NS[LIDAR], LIDAR, sweep.start_ns, _serialise(LIDAR, _cloud_message(sweep))
+
+
+def _cloud_message(sweep: Sweep) -> Any:
+    points = np.zeros(len(sweep.xyz), POINT)
+    points["x"], points["y"], points["z"] = sweep.xyz.T
+    points["intensity"], points["ring"], points["time"] = sweep.intensity, sweep.ring, sweep.time_s
+    point_field = _class("sensor_msgs/msg/PointField")
+    kinds = {"<f4": 7, "<u2": 4}
+    fields = [
+        point_field(name, POINT.fields[name][1], kinds[POINT.fields[name][0].str], 1)
+        for name in POINT.names or ()
+    ]
+    return _class(TYPES[LIDAR])(
+        header=_header(sweep.start_ns, "lidar"),
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=POINT.itemsize,
+        row_step=POINT.itemsize * len(points),
+        data=points.view(np.uint8).reshape(-1),
+        is_dense=True,
+    )
+
+
+def _imu(track: ImuTrack) -> Iterator[Entry]:
+    unknown = np.array([-1.0, *[0.0] * 8])
+    level = _class("geometry_msgs/msg/Quaternion")(0.0, 0.0, 0.0, 1.0)
+    for stamp, gyro, accel in zip(track.stamp_ns.tolist(), track.gyro_rad_s, track.accel_m_s2):
+        message = _class(TYPES[IMU])(
+            _header(stamp, "imu"), level, unknown, _vector(gyro), np.zeros(9), _vector(accel), np.zeros(9)
+        )
+        yield stamp + DELAY_NS[IMU], IMU, stamp, _serialise(IMU, message)
+
+
+def _wheel(track: WheelTrack) -> Iterator[Entry]:
+    covariance = np.diag([4e-4, 1e-2, 1.0, 1.0, 1.0, 1.0]).ravel()
+    for stamp, speed in zip(track.stamp_ns.tolist(), track.speed_m_s.tolist()):
+        twist = _class("geometry_msgs/msg/Twist")(_vector([speed, 0.0, 0.0]), _vector([0.0, 0.0, 0.0]))
+        with_covariance = _class("geometry_msgs/msg/TwistWithCovariance")(twist, covariance)
+        message = _class(TYPES[WHEEL])(_header(stamp, "base_link"), with_covariance)
+        yield stamp + DELAY_NS[WHEEL], WHEEL, stamp, _serialise(WHEEL, message)
+
+
+def _gnss(track: GnssTrack) -> Iterator[Entry]:
+    for k, stamp in enumerate(track.stamp_ns.tolist()):
+        status = _class("sensor_msgs/msg/NavSatStatus")(int(track.status[k]), 1)
+        latitude, longitude, height = track.geodetic[k].tolist()
+        covariance = np.diag(track.variance_m2[k]).ravel()
+        message = _class(TYPES[GNSS])(
+            _header(stamp, "gnss"), status, latitude, longitude, height, covariance, 2
+        )
+        yield stamp + DELAY_NS[GNSS], GNSS, stamp, _serialise(GNSS, message)
+
+
+def _tf(start_ns: int) -> Iterator[Entry]:
+    frames = [_transform(start_ns, child, T) for child, T in T_BASE.items()]
+    yield start_ns, TF, start_ns, _serialise(TF, _class(TYPES[TF])(frames))
+
+
+def _transform(stamp_ns: int, child: str, T: F8) -> Any:
+    qw, qx, qy, qz = quaternion_from_matrix(T[:3, :3]).tolist()
+    rotation = _class("geometry_msgs/msg/Quaternion")(qx, qy, qz, qw)
+    transform = _class("geometry_msgs/msg/Transform")(_vector(T[:3, 3]), rotation)
+    return _class("geometry_msgs/msg/TransformStamped")(_header(stamp_ns, "base_link"), child, transform)
+
+
+def _vector(xyz: Any) -> Any:
+    return _class("geometry_msgs/msg/Vector3")(*(float(v) for v in xyz))
+
+
+def _header(stamp_ns: int, frame: str) -> Any:
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    return _class("std_msgs/msg/Header")(_class("builtin_interfaces/msg/Time")(seconds, nanoseconds), frame)
+
+
+def _serialise(topic: str, message: Any) -> bytes:
+    return bytes(_types().serialize_cdr(message, TYPES[topic]))

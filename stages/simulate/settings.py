@@ -1,0 +1,86 @@
+"""What can be asked of the simulator."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+SMALL = {"duration_s": 8.0, "beams": 16, "columns": 512, "standstill_s": 1.0}
+"""What `size: small` changes unless it is set by hand: a log of seconds for tests."""
+
+
+class Settings(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    size: Literal["sample", "small"] = Field(
+        "sample",
+        description="sample: about three minutes and 1.2 km; small: some seconds with a coarse LiDAR",
+    )
+    seed: int = Field(0, ge=0, le=2**31, description="seed of all sensor noise and of traffic")
+    town_seed: int = Field(0, ge=0, le=2**31, description="seed of the town: houses, trees, poles")
+    parking_seed: int = Field(
+        0, ge=0, le=2**31, description="seed of the parked cars; another one is another day"
+    )
+    start_s: int = Field(
+        1_760_000_000, ge=0, le=4_000_000_000, description="time of the first sample since 1970, s"
+    )
+    duration_s: float = Field(180.0, ge=1.0, le=7200.0, description="length of the log, s")
+    route: Literal["town", "roundabout"] = Field(
+        "town", description="town: the whole lap, again and again; roundabout: circles of 54 m, a tiny loop"
+    )
+    start_m: float = Field(0.0, ge=0.0, le=5000.0, description="place on the route where the drive starts, m")
+    standstill_s: float = Field(2.5, ge=0.0, le=60.0, description="time at rest before the drive, s")
+    top_speed_m_s: float = Field(13.0, ge=1.0, le=30.0, description="speed limit outside the town, m/s")
+    traffic: bool = Field(True, description="cars, a truck, a cyclist and pedestrians move about")
+    dust_per_m: float = Field(
+        0.25, ge=0.0, le=5.0, description="extinction of fresh dust behind the truck, 1/m"
+    )
+
+    beams: Literal[16, 32, 64] = Field(32, description="beams of the LiDAR")
+    rate_hz: Literal[10, 20] = Field(10, description="sweeps per second, Hz")
+    columns: int = Field(1024, ge=64, le=4096, description="firings per sweep")
+    low_deg: float = Field(-25.0, ge=-60.0, le=0.0, description="elevation of the lowest beam, deg")
+    high_deg: float = Field(15.0, ge=0.0, le=60.0, description="elevation of the highest beam, deg")
+    max_range_m: float = Field(100.0, ge=10.0, le=300.0, description="range beyond which nothing is seen, m")
+    range_noise_m: float = Field(0.02, ge=0.0, le=0.5, description="standard deviation of a range, m")
+    dropout: float = Field(0.02, ge=0.0, le=0.9, description="share of returns lost by chance")
+    outliers: float = Field(2e-4, ge=0.0, le=0.1, description="share of returns at a wrong range")
+
+    gyro_noise_rad_s: float = Field(0.002, ge=0.0, le=0.1, description="white noise of a gyro sample, rad/s")
+    gyro_bias_rad_s: float = Field(
+        0.004, ge=0.0, le=0.1, description="standard deviation of the gyro bias, rad/s"
+    )
+    gyro_walk_rad_s: float = Field(2e-4, ge=0.0, le=0.01, description="growth of the gyro bias in 1 s, rad/s")
+    accel_noise_m_s2: float = Field(
+        0.03, ge=0.0, le=1.0, description="white noise of an accelerometer sample, m/s2"
+    )
+    accel_bias_m_s2: float = Field(0.05, ge=0.0, le=1.0, description="standard deviation of its bias, m/s2")
+    accel_walk_m_s2: float = Field(1e-3, ge=0.0, le=0.1, description="growth of its bias in 1 s, m/s2")
+    wheel_scale: float = Field(0.01, ge=-0.2, le=0.2, description="scale error of the wheel speed")
+    wheel_noise_m_s: float = Field(0.02, ge=0.0, le=1.0, description="white noise of the wheel speed, m/s")
+    wheel_slip: float = Field(
+        0.25, ge=0.0, le=1.0, description="excess of the wheel speed at the height of a slip"
+    )
+    stamp_jitter_s: float = Field(1e-4, ge=0.0, le=0.01, description="error of IMU and wheel stamps, s")
+
+    gnss: bool = Field(True, description="a GNSS receiver is on board")
+    gnss_multipath_m: float = Field(
+        4.0, ge=0.0, le=50.0, description="size of the lie between high houses, m"
+    )
+    latitude_deg: float = Field(
+        48.137, ge=-80.0, le=80.0, description="WGS84 latitude of the town's origin, deg"
+    )
+    longitude_deg: float = Field(
+        11.576, ge=-180.0, le=180.0, description="WGS84 longitude of the town's origin, deg"
+    )
+    height_m: float = Field(
+        560.0, ge=-500.0, le=9000.0, description="ellipsoidal height of the town's origin, m"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _small(cls, given: Any) -> Any:
+        if isinstance(given, dict) and given.get("size") == "small":
+            return {**SMALL, **given}
+        return given

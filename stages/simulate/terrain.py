@@ -1,0 +1,171 @@
+"""The ground: height, roads, what it is made of.
+
+Coordinates are metres east, north and up of the town's origin. South Street runs along y = 0 into the tunnel and on to
+the field; the bridge carries a street along x = BRIDGE_X over North Street (y = NORTH_Y).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.simulate.meshes import Material, Mesh, grid_mesh
+
+WEST, EAST, SOUTH, NORTH = -185.0, 350.0, -110.0, 255.0
+CELL_M = 1.25
+RASTER_M = 0.25
+BRIDGE_X, NORTH_Y, PLATEAU_Y, FIELD_X, EAST_X = 45.0, 90.0, 150.0, 245.0, 90.0
+OPENING = (82.0, 98.0)
+TUNNEL = (125.0, 197.0)
+RISE_M, DIP_M = 4.2, 2.0
+ROUNDABOUT = (-75.0, 0.0)
+ROUNDABOUT_R = 9.0
+LANE_M = 1.75
+
+
+@dataclass(frozen=True)
+class Road:
+    """Straight from `a` to `b`, or an arc about `centre`; `town` roads have parking bays and sidewalks."""
+
+    a: tuple[float, float]
+    b: tuple[float, float]
+    town: bool = True
+    centre: tuple[float, float] | None = None
+
+    def distance(self, x: F8, y: F8) -> F8:
+        """Distance to the centre line, m; infinite beside the ends of an arc."""
+        if self.centre is not None:
+            return self._arc_distance(x, y, self.centre)
+        dx, dy = self.b[0] - self.a[0], self.b[1] - self.a[1]
+        along = ((x - self.a[0]) * dx + (y - self.a[1]) * dy) / (dx * dx + dy * dy)
+        along = np.clip(along, 0, 1)
+        return np.hypot(x - self.a[0] - along * dx, y - self.a[1] - along * dy)
+
+    def _arc_distance(self, x: F8, y: F8, centre: tuple[float, float]) -> F8:
+        u, v = x - centre[0], y - centre[1]
+        radius = np.hypot(self.a[0] - centre[0], self.a[1] - centre[1])
+        off = np.abs(np.hypot(u, v) - radius)
+        if self.a == self.b:
+            return off
+        start = np.arctan2(self.a[1] - centre[1], self.a[0] - centre[0])
+        end = np.arctan2(self.b[1] - centre[1], self.b[0] - centre[0])
+        inside = np.mod(np.arctan2(v, u) - start, 2 * np.pi) <= np.mod(end - start, 2 * np.pi)
+        return np.where(inside, off, np.inf)
+
+
+ROADS = (
+    Road((-66, 0), (118, 0)),
+    Road((118, 0), (215, 0), town=False),
+    Road((215, 0), (245, 30), town=False, centre=(215, 30)),
+    Road((245, 30), (245, 120), town=False),
+    Road((245, 120), (215, 150), town=False, centre=(215, 120)),
+    Road((215, 150), (-20, 150), town=False),
+    Road((45, 150), (45, OPENING[1]), town=False),
+    Road((45, OPENING[0]), (45, 0), town=False),
+    Road((90, 0), (90, 90)),
+    Road((115, 90), (-20, 90)),
+    Road((0, 0), (0, 90)),
+    Road((-66, 0), (-66, 0), town=False, centre=ROUNDABOUT),
+)
+
+
+def smoothstep(u: ArrayLike) -> F8:
+    """0 to 1 over u in 0..1 with two continuous derivatives."""
+    u = np.clip(np.asarray(u, float), 0, 1)
+    return u**3 * (10 - 15 * u + 6 * u**2)
+
+
+def road_distance(x: F8, y: F8) -> tuple[F8, NDArray[np.bool_]]:
+    """Distance to the nearest centre line, m, and whether that road is one of the town."""
+    best, town = np.full(np.shape(x), np.inf), np.zeros(np.shape(x), bool)
+    for road in ROADS:
+        d = road.distance(x, y)
+        nearer = d < best
+        best, town = np.where(nearer, d, best), np.where(nearer, road.town, town)
+    return best, town
+
+
+def relief(x: F8, y: F8) -> F8:
+    """Hills and hollows of the land before anything was built, m."""
+    return 1.5 * np.sin(x / 58 + 0.4) * np.cos(y / 71) + 0.5 * np.sin(x / 23 - y / 37) + 0.008 * x
+
+
+def embankment(x: F8) -> F8:
+    """1 on the ramps of the bridge, 0 beside them."""
+    return 1 - smoothstep((np.abs(x - BRIDGE_X) - 5.5) / 5.0)
+
+
+def height(x: ArrayLike, y: ArrayLike) -> F8:
+    """Height of the ground, m: relief, plateau in the north, ramps, underpass, road camber and kerbs."""
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    plateau = RISE_M * smoothstep((y - 100) / 45)
+    south, north = y < OPENING[0], y > OPENING[1]
+    ramp = np.where(south, RISE_M * smoothstep((y - 8) / 68), np.where(north, RISE_M, 0.0))
+    on_ramp = embankment(x) * (south | north) * (y > 0)
+    dip = DIP_M * np.exp(-(((x - BRIDGE_X) / 18) ** 2)) * (1 - smoothstep((np.abs(y - NORTH_Y) - 5) / 5))
+    return relief(x, y) + plateau + on_ramp * (ramp - plateau) - dip * (1 - on_ramp) + _road_profile(x, y)
+
+
+def deck_height(x: ArrayLike, y: ArrayLike) -> F8:
+    """Height of the road on the bridge, m."""
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    return relief(x, y) + RISE_M - 0.02 * np.minimum(np.abs(x - BRIDGE_X), 3.5)
+
+
+def _road_profile(x: F8, y: F8) -> F8:
+    """Camber of 2 % on the lanes, sidewalks 0.1 m above the road in town, verges 0.1 m below elsewhere."""
+    d, town = road_distance(x, y)
+    camber = -0.02 * np.minimum(d, 3.5)
+    kerb = np.where(town, 0.1 * smoothstep((d - 5.5) / 0.6), -0.1 * smoothstep((d - 4.2) / 1.5))
+    return camber + kerb
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """The ground as a grid of heights, and a raster of what it is made of."""
+
+    z: NDArray[np.float32]
+    """(rows, columns) height at the grid's corners, m; row 0 is the south."""
+    material: NDArray[np.uint8]
+    """(rows, columns) `Material` of each raster cell."""
+
+    def height(self, x: F8, y: F8) -> F8:
+        """Height of the ground as it was built, m: bilinear between the corners."""
+        u = np.clip((x - WEST) / CELL_M, 0, self.z.shape[1] - 1.001)
+        v = np.clip((y - SOUTH) / CELL_M, 0, self.z.shape[0] - 1.001)
+        i, j = u.astype(int), v.astype(int)
+        a, b = u - i, v - j
+        z = self.z.astype(float)
+        lower = z[j, i] * (1 - a) + z[j, i + 1] * a
+        upper = z[j + 1, i] * (1 - a) + z[j + 1, i + 1] * a
+        out: F8 = lower * (1 - b) + upper * b
+        return out
+
+    def mesh(self) -> Mesh:
+        x = WEST + CELL_M * np.arange(self.z.shape[1])
+        y = SOUTH + CELL_M * np.arange(self.z.shape[0])
+        return grid_mesh(x, y, self.z.astype(float), Material.GRASS)
+
+
+def build_terrain(rng: np.random.Generator) -> Terrain:
+    """The ground with rough grass; roads stay smooth."""
+    x, y = np.meshgrid(np.arange(WEST, EAST + 0.1, CELL_M), np.arange(SOUTH, NORTH + 0.1, CELL_M))
+    d, _ = road_distance(x, y)
+    rough = 0.006 + 0.04 * smoothstep((d - 6) / 4)
+    z = height(x, y) + rough * rng.standard_normal(x.shape)
+    return Terrain(z.astype(np.float32), _materials())
+
+
+def _materials() -> NDArray[np.uint8]:
+    x, y = np.meshgrid(np.arange(WEST, EAST, RASTER_M) + 0.125, np.arange(SOUTH, NORTH, RASTER_M) + 0.125)
+    d, town = road_distance(x, y)
+    out = np.full(x.shape, Material.GRASS, np.uint8)
+    out[town & (d < 8.2)] = Material.PAVING
+    out[d < np.where(town, 5.7, 3.9)] = Material.ASPHALT
+    dashes = (d < 0.13) & (np.mod(x + y, 9.0) < 4.0)
+    edges = ~town & (np.abs(d - 3.4) < 0.13)
+    out[dashes | edges] = Material.MARKING
+    return out
