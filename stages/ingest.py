@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import chain, islice
 
-from scanloom.schemas.errors import InvalidInput
 from scanloom.schemas.product import Part
 from scanloom.schemas.scans import Scan, Scans
 from scanloom.schemas.session import RawLog, Session
@@ -15,7 +14,7 @@ from scanloom.stages.logs.reader import describe_place, open_log, session_name
 from scanloom.stages.logs.records import CloudFile, LivoxCloud, LogSource, PointCloud2
 from scanloom.stages.logs.roles import assign_roles, no_lidar
 from scanloom.stages.logs.survey import Survey
-from scanloom.stages.logs.sweeps import CloudMessage, ScanMaker
+from scanloom.stages.logs.sweeps import CloudMessage, ScanMaker, too_few_scans
 
 __all__ = ["VERSION", "Settings", "ingest"]
 
@@ -43,7 +42,9 @@ def ingest(settings: Settings, raw_log: RawLog) -> Iterator[Output]:
     survey = Survey(source, roles, settings)
     maker = ScanMaker(settings, roles.lidar, survey.period_ns())
     scans = maker.ordered(_clouds(survey, source))
-    first = _at_least_two(scans, source, where)
+    first = list(islice(scans, _MIN_SCANS))
+    if len(first) < _MIN_SCANS:
+        raise too_few_scans(len(first), source, maker.finish(), where)
     yield from _chunks(chain(first, scans), settings)
     imu, gnss = survey.imu(), survey.gnss()
     yield imu
@@ -60,20 +61,6 @@ def _clouds(survey: Survey, source: LogSource) -> Iterator[CloudMessage]:
             message.body, PointCloud2 | LivoxCloud | CloudFile
         ):
             yield message.body
-
-
-def _at_least_two(scans: Iterator[Scan], source: LogSource, where: str) -> list[Scan]:
-    first = list(islice(scans, _MIN_SCANS))
-    if len(first) < _MIN_SCANS:
-        damage = f" The log is damaged: {'; '.join(source.damage.texts)}." if source.damage else ""
-        raise InvalidInput(
-            f"The log holds {len(first)} readable scan{'s' * (len(first) != 1)}; a map needs at least two.{damage}",
-            where=where,
-            next_step="copy the log again from where it was recorded, or give another one"
-            if damage
-            else "record for longer, or give another log",
-        )
-    return first
 
 
 def _chunks(scans: Iterator[Scan], settings: Settings) -> Iterator[Part[Scans]]:

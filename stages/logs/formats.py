@@ -25,3 +25,11 @@ def detect(names: Sequence[str]) -> str:
     if any(path.suffix.lower() in SCAN_SUFFIXES for path in paths):
         return "point files"
     return ""
+
+
+def stem_of(name: str) -> str:
+    """A bag's name without its endings."""
+    stem = name
+    for suffix in (".zstd", ".active", ".bag", ".mcap", ".db3"):
+        stem = stem.removesuffix(suffix)
+    return stem or name

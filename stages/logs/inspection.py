@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import difflib
 from dataclasses import asdict, dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from scanloom.schemas.errors import InvalidInput, ScanloomError
+from pydantic import ValidationError
+
+from scanloom.schemas.errors import InvalidInput, ScanloomError, UsageError
 from scanloom.schemas.session import Extrinsic, Problem, Session, Topic
 from scanloom.stages.logs.locate import locate
 from scanloom.stages.logs.options import Settings
@@ -77,7 +80,7 @@ def inspect_log(path: Path, settings: Settings | None = None) -> Inspection:
     """
     located = locate(path)
     given = (settings or Settings()).model_dump(exclude_unset=True)
-    merged = Settings.model_validate({**located.settings.get("ingest", {}), **given})
+    merged = _settings({**located.settings.get("ingest", {}), **given}, str(path))
     source = open_log(located.raw_log, merged.scan_rate_hz)
     session, error, used = _look(source, merged, str(path))
     sizes = [(located.raw_log.root or Path()) / name for name in located.raw_log.names]
@@ -105,6 +108,17 @@ def inspect_log(path: Path, settings: Settings | None = None) -> Inspection:
         problems=problems,
         next_step=_next_step(path, session, error),
     )
+
+
+def _settings(values: dict[str, Any], where: str) -> Settings:
+    try:
+        return Settings.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        near = difflib.get_close_matches(name, Settings.model_fields, 1, 0.4)
+        hint = f"did you mean ingest.{near[0]}?" if near and near[0] != name else "correct the session file"
+        raise UsageError(f"ingest.{name}: {first['msg']}", where=where, next_step=hint) from error
 
 
 def _look(

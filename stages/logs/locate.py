@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,14 +9,14 @@ from typing import Any
 
 from scanloom.schemas.errors import InvalidInput
 from scanloom.schemas.session import RawLog, TruthLog
-from scanloom.stages.logs.formats import SCAN_SUFFIXES, detect
+from scanloom.stages.logs.formats import SCAN_SUFFIXES, detect, stem_of
 
 ACCEPTED = (
     "a .bag, .mcap or .db3 file, a rosbag2 folder, a folder of split bags, a KITTI raw or odometry folder, "
     "a folder of PCD, PLY or .bin scans, or a session.yaml"
 )
 SESSION_FILES = ("session.yaml", "session.yml")
-_DRIVE = re.compile(r"\d{4}_\d\d_\d\d_drive_\d+_\w+")
+_DEEPEST = 2
 _TRUTH_NAMES = ("truth", "ground_truth", "gt")
 _MAGICS = {
     ".bag": (b"#ROSBAG V2.0", b"#ROSBAG V1"),
@@ -50,6 +49,15 @@ def locate(path: Path) -> Located:
     """
     if not path.exists():
         raise InvalidInput("There is no such file or folder.", where=str(path), next_step=f"give {ACCEPTED}")
+    try:
+        return _found(path)
+    except OSError as error:
+        raise InvalidInput(
+            f"It cannot be read ({error.strerror}).", where=str(path), next_step="check its permissions"
+        ) from error
+
+
+def _found(path: Path) -> Located:
     if path.is_dir():
         return _folder(path)
     if path.name in SESSION_FILES or path.suffix in (".yaml", ".yml"):
@@ -71,10 +79,11 @@ def _file(path: Path) -> Located:
         )
     found = detect([path.name])
     names = [path.name]
+    truth = truth_in(path.parent / "truth")
     # a database whose recorder died keeps its last messages in a file beside it
     if path.with_name(path.name + "-wal").is_file():
         names.append(path.name + "-wal")
-    return Located(_stem(path), found, RawLog(path.parent, tuple(names)))
+    return Located(stem_of(path.name), found, RawLog(path.resolve().parent, tuple(names)), truth)
 
 
 def check_file(path: Path) -> None:
@@ -84,13 +93,8 @@ def check_file(path: Path) -> None:
     ------
     InvalidInput : it does not.
     """
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(4096)
-    except OSError as error:
-        raise InvalidInput(
-            f"The file cannot be read ({error.strerror}).", where=str(path), next_step="check its permissions"
-        ) from error
+    with path.open("rb") as stream:
+        head = stream.read(4096)
     if not head:
         raise InvalidInput(
             "The file is empty.",
@@ -123,15 +127,18 @@ def _what_it_is(head: bytes) -> str:
     return "plain text" if printable > 0.95 * len(head) else "something that is no known log"
 
 
-def _folder(path: Path) -> Located:
+def _folder(path: Path, depth: int = 0) -> Located:
     files = sorted(p for p in path.iterdir() if p.is_file())
     session = [p for p in files if p.name in SESSION_FILES]
     if session:
         return locate(session[0])
-    for attempt in (_kitti_raw, _kitti_odometry, _bags, _scans, _only_child):
+    for attempt in (_kitti_raw, _kitti_odometry, _bags, _scans):
         found = attempt(path, files)
         if found is not None:
             return found
+    found = _only_child(path, depth) if depth < _DEEPEST else None
+    if found is not None:
+        return found
     holds = f"it holds {files[0].name}" if files else "it is empty"
     more = f" and {len(files) - 1} more files" if len(files) > 1 else ""
     raise InvalidInput(
@@ -243,13 +250,13 @@ def _scans(path: Path, files: Sequence[Path]) -> Located | None:
     )
 
 
-def _only_child(path: Path, files: Sequence[Path]) -> Located | None:
+def _only_child(path: Path, depth: int) -> Located | None:
     """A folder around the log: of the folders in it, the one that is a log."""
     found: list[Located] = []
     for child in sorted(p for p in path.iterdir() if p.is_dir() and p.name.lower() not in _TRUTH_NAMES):
         try:
-            found.append(_folder(child))
-        except InvalidInput:
+            found.append(_folder(child, depth + 1))
+        except (InvalidInput, OSError):
             continue
     if len(found) > 1:
         names = ", ".join(log.name for log in found[:5])
@@ -264,20 +271,18 @@ def _only_child(path: Path, files: Sequence[Path]) -> Located | None:
 
 
 def truth_beside(path: Path) -> TruthLog:
-    """Truth in a folder `truth` inside or beside the log."""
-    for folder in (path / "truth", path.parent / "truth"):
-        if folder.is_dir():
-            root = folder.resolve()
-            return TruthLog(root, tuple(p.relative_to(root).as_posix() for p in _walk(root)))
-    return TruthLog()
+    """Truth in a folder `truth` inside or beside the log's folder."""
+    inside = truth_in(path / "truth")
+    return inside if inside.names else truth_in(path.resolve().parent / "truth")
+
+
+def truth_in(folder: Path) -> TruthLog:
+    """All files of the folder; no files when there is no such folder."""
+    if not folder.is_dir():
+        return TruthLog()
+    root = folder.resolve()
+    return TruthLog(root, tuple(p.relative_to(root).as_posix() for p in _walk(root)))
 
 
 def _walk(folder: Path) -> list[Path]:
     return sorted(p for p in folder.rglob("*") if p.is_file())
-
-
-def _stem(path: Path) -> str:
-    name = path.name
-    for suffix in (".zstd", ".active", ".bag", ".mcap", ".db3"):
-        name = name.removesuffix(suffix)
-    return name or path.name

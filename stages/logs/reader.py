@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 from scanloom.schemas.errors import InvalidInput
 from scanloom.schemas.session import RawLog
 from scanloom.stages.logs.bags import open_bags
-from scanloom.stages.logs.formats import detect
+from scanloom.stages.logs.formats import detect, stem_of
 from scanloom.stages.logs.records import LogSource
 
 
@@ -46,5 +46,9 @@ def describe_place(raw_log: RawLog) -> str:
 
 def session_name(raw_log: RawLog) -> str:
     """A name that depends on the names inside the log only, so that a moved log gives the same bytes."""
-    first = PurePosixPath(raw_log.names[0])
-    return first.parts[0] if len(first.parts) > 1 else first.stem
+    found = detect(raw_log.names)
+    if found == "kitti raw":
+        drive = next(PurePosixPath(name) for name in raw_log.names if "velodyne_points" in name)
+        return drive.parts[0]
+    bags = [PurePosixPath(name).name for name in raw_log.names if detect([name]) and name != "metadata.yaml"]
+    return stem_of(bags[0]) if found in ("rosbag1", "rosbag2", "mcap") and bags else found

@@ -79,6 +79,8 @@ def _named(topics: Sequence[TopicInfo], role: str, kind: Kind, name: str) -> str
 
 
 def _best(source: LogSource, role: str, candidates: list[TopicInfo], roles: Roles) -> str:
+    # a map or a path that is sent once is no sensor
+    candidates = [topic for topic in candidates if topic.count > 1] or candidates
     if not candidates:
         return ""
     if len(candidates) == 1:
@@ -92,13 +94,18 @@ def _best(source: LogSource, role: str, candidates: list[TopicInfo], roles: Role
     roles.problems.append(
         Problem(
             code=f"{role}.ambiguous",
-            severity="info" if role != "lidar" else "warning",
+            severity="warning" if role == "lidar" and _comparable(best, others[0]) else "info",
             text=f"The log has {len(candidates)} topics that could be the {role}: {best.name} ({_rate(best)}) is used, "
             f"not {rates}{more}. Choose with ingest.{role}_topic.",
             topic=best.name,
         )
     )
     return best.name
+
+
+def _comparable(a: TopicInfo, b: TopicInfo) -> bool:
+    """Whether the choice between two clouds may well be wrong: neither is by its name or rate a derived one."""
+    return _demerits("lidar", a, Roles())[:2] == _demerits("lidar", b, Roles())[:2]
 
 
 def _first_size(source: LogSource, topic: TopicInfo) -> int:

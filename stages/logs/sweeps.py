@@ -21,7 +21,7 @@ from scanloom.stages.logs.pointcloud import (
     decode_livox,
     decode_pointcloud2,
 )
-from scanloom.stages.logs.records import Cloud, CloudFile, LivoxCloud, PointCloud2
+from scanloom.stages.logs.records import Cloud, CloudFile, LivoxCloud, LogSource, PointCloud2
 
 CloudMessage = PointCloud2 | LivoxCloud | CloudFile
 PointTime = Literal["per point", "from azimuth", "none"]
@@ -203,6 +203,19 @@ def _rows(cloud: Cloud, rows: NDArray[np.int64]) -> Cloud:
         ring=cloud.ring[rows],
         return_no=cloud.return_no[rows],
         time_ns=None if cloud.time_ns is None else cloud.time_ns[rows],
+    )
+
+
+def too_few_scans(readable: int, source: LogSource, tally: ScanTally, where: str) -> InvalidInput:
+    """The error of a log with fewer scans than a map needs, which says what became of the others."""
+    why = [f"The log is damaged: {'; '.join(source.damage.texts[:3])}."] if source.damage else []
+    why += [problem.text for problem in tally.problems if problem.severity == "warning"]
+    scans = f"{readable} readable scan{'s' * (readable != 1)}"
+    advice = "copy the log again from where it was recorded, or give another one"
+    return InvalidInput(
+        " ".join([f"The log holds {scans}; a map needs at least two.", *why]),
+        where=where,
+        next_step=advice if source.damage else "record for longer, or give another log",
     )
 
 

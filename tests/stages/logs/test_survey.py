@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scanloom.schemas.errors import InvalidInput
+from scanloom.schemas.errors import InvalidInput, UsageError
 from scanloom.schemas.tracks import Gnss, Imu
 from scanloom.stages.logs.checks import gnss_problems, imu_problems, stamp_problems
 from scanloom.stages.logs.inspection import inspect_log
@@ -217,3 +217,10 @@ def test_real_logs_are_explained(shared_data: Path, name: str, usable: bool, exp
     assert found.usable == usable
     assert expected <= {problem.code for problem in found.problems}
     assert usable == found.next_step.startswith("scanloom map")
+
+
+def test_a_wrong_setting_in_a_session_file_is_named(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "a.mcap", drive(ROS2))
+    (tmp_path / "session.yaml").write_text("log: a.mcap\nsettings: {ingest: {chunk_sec: 3}}\n")
+    with pytest.raises(UsageError, match=r"ingest\.chunk_sec.*did you mean ingest\.chunk_s"):
+        inspect_log(tmp_path)
