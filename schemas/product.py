@@ -375,6 +375,10 @@ class Parts(Sequence[ProductT]):
     def items(self) -> Iterator[tuple[dict[str, str], ProductT]]:
         return ((dict(coordinate), self._product(entry)) for coordinate, entry in self._parts)
 
+    def coordinates(self) -> list[dict[str, str]]:
+        """Where the parts stand, without loading one."""
+        return [dict(coordinate) for coordinate, _ in self._parts]
+
     def by(self, axis: str) -> dict[str, Parts[ProductT]]:
         """Group by one axis, for instance `by("session")`, in sorted order."""
         groups: dict[str, list[tuple[Coordinate, Any]]] = {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import dataclass
 from typing import IO
 
 import numpy as np
@@ -40,37 +41,53 @@ def overview(settings: Settings, tiles: Parts[Tile]) -> tuple[TileIndex, MapFile
             "the map has no tiles: no point was kept",
             next_step="look at the labels and at `tiling.classes`, which says which classes enter the map",
         )
-    index = tile_index(tiles)
-    picks = [coarse_picks(tile, settings.map_voxel_size_m) for tile in tiles]
+    surveys = [_survey(c["tile"], tile, settings.map_voxel_size_m) for c, tile in tiles.items()]
+    index = tile_index(surveys, tiles[0])
 
     def write_map(stream: IO[bytes]) -> None:
         comments = ply.georeference_comments(index.frame, index.georeference, (0.0, 0.0, 0.0))
-        stream.write(ply.header(sum(map(len, picks)), ["scanloom map", *comments]))
-        for tile, picked in zip(tiles, picks):
-            stream.write(_vertices(tile, picked))
+        points = sum(len(survey.picks) for survey in surveys)
+        stream.write(ply.header(points, ["scanloom map", *comments]))
+        for tile, survey in zip(tiles, surveys):
+            stream.write(_vertices(tile, survey.picks))
 
     return index, MapFiles(contents={"map.ply": write_map})
 
 
-def tile_index(tiles: Parts[Tile]) -> TileIndex:
-    """One row per tile, ordered by (x, y)."""
-    rows = sorted(
-        ((tile_position(c["tile"]), c["tile"], tile) for c, tile in tiles.items()), key=lambda row: row[0]
-    )
-    first = rows[0][2]
-    bounds = [_bounds(tile) for _, _, tile in rows]
+@dataclass(frozen=True)
+class Survey:
+    """What the overview keeps of a tile, so that tiles are in memory one by one."""
+
+    name: str
+    points: int
+    low_m: NDArray[np.float64]
+    high_m: NDArray[np.float64]
+    sessions: tuple[str, ...]
+    checksum: str
+    picks: NDArray[np.int64]
+
+
+def _survey(name: str, tile: Tile, map_voxel_size_m: float) -> Survey:
+    low, high = _bounds(tile)
+    picks = coarse_picks(tile, map_voxel_size_m)
+    return Survey(name, len(tile), low, high, tuple(tile.sessions), checksum(tile), picks)
+
+
+def tile_index(surveys: list[Survey], example: Tile) -> TileIndex:
+    """One row per tile, ordered by (x, y); grid and georeference are those of any tile."""
+    rows = sorted(surveys, key=lambda survey: tile_position(survey.name))
     return TileIndex(
-        tile=np.array([name for _, name, _ in rows], object),
+        tile=np.array([row.name for row in rows], object),
         level=np.zeros(len(rows), np.int32),
-        points=np.array([len(tile) for _, _, tile in rows], np.int64),
-        min_m=np.array([low for low, _ in bounds]),
-        max_m=np.array([high for _, high in bounds]),
-        sessions=np.array([" ".join(tile.sessions) for _, _, tile in rows], object),
-        checksum=np.array([checksum(tile) for _, _, tile in rows], object),
-        frame=first.frame,
-        georeference=first.georeference,
-        tile_size_m=first.tile_size_m,
-        voxel_size_m=first.voxel_size_m,
+        points=np.array([row.points for row in rows], np.int64),
+        min_m=np.array([row.low_m for row in rows]),
+        max_m=np.array([row.high_m for row in rows]),
+        sessions=np.array([" ".join(row.sessions) for row in rows], object),
+        checksum=np.array([row.checksum for row in rows], object),
+        frame=example.frame,
+        georeference=example.georeference,
+        tile_size_m=example.tile_size_m,
+        voxel_size_m=example.voxel_size_m,
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
@@ -14,6 +16,9 @@ from scanloom.stages.tiling import ply
 from scanloom.stages.tiling.grid import tile_position
 
 VERSION = 1
+
+ROWS_AT_ONCE = 500_000
+"""Voxels that wait to be merged."""
 
 
 class Settings(BaseModel):
@@ -37,10 +42,31 @@ def tiles(settings: Settings, pieces: Parts[Piece]) -> tuple[Tile, TileFiles]:
     StageError : there are no pieces, or they belong to different grids or tiles.
     """
     name, sessions = _identity(pieces)
-    merged = merge(list(pieces))
+    merged = merge_all(name, pieces)
     kept = merged.take((merged.count >= settings.min_points) & (merged.scan_count >= settings.min_scans))
     tile = _average(kept, name, sessions)
     return tile, TileFiles(contents={"tile.ply": tile_ply(tile)})
+
+
+def merge_all(name: str, pieces: Iterable[Piece]) -> Piece:
+    """Merge piece after piece, so that a place passed a hundred times takes no more memory than one passed twice.
+
+    Raises
+    ------
+    StageError : the pieces were made with different grids or georeferences.
+    """
+    waiting: list[Piece] = []
+    for piece in pieces:
+        if waiting and waiting[0].attributes != piece.attributes:
+            raise StageError(
+                "the pieces of this tile were made with different grids or georeferences",
+                where=f"tile {name}",
+                next_step="run tiling again for all sessions with the same settings",
+            )
+        waiting.append(piece)
+        if sum(map(len, waiting)) > 2 * len(waiting[0]) + ROWS_AT_ONCE:
+            waiting = [merge(waiting)]
+    return merge(waiting)
 
 
 def merge(pieces: list[Piece]) -> Piece:
@@ -75,17 +101,10 @@ def _sum_runs(values: NDArray, order: NDArray[np.int64], starts: NDArray[np.int6
 
 def _identity(pieces: Parts[Piece]) -> tuple[str, tuple[str, ...]]:
     """Name of the tile and the sessions that contribute."""
-    coordinates = [coordinate for coordinate, _ in pieces.items()]
+    coordinates = pieces.coordinates()
     names = {coordinate["tile"] for coordinate in coordinates}
     if len(names) != 1:
         raise StageError(f"expected the pieces of one tile, got those of {len(names)}")
-    grids = {(p.voxel_size_m, p.tile_size_m, p.frame, str(p.georeference)) for p in pieces}
-    if len(grids) != 1:
-        raise StageError(
-            "the pieces of this tile were made with different grids or georeferences",
-            where=f"tile {names.pop()}",
-            next_step="run tiling again for all sessions with the same settings",
-        )
     return names.pop(), tuple(sorted({c["session"] for c in coordinates if "session" in c}))
 
 

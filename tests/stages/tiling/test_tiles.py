@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -118,3 +119,15 @@ def test_a_tile_survives_its_file(world, tmp_path: Path) -> None:  # type: ignor
     back = type(tile).open(tmp_path / "tile.parquet")
     assert back.to_arrow().equals(tile.to_arrow())
     assert tuple(back.offset_m) == tile.offset_m
+
+
+def test_many_pieces_merge_batch_by_batch(world, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
+    whole = tiles_of([Source("a", "0000", pieces_of(*world))])
+    monkeypatch.setattr(sys.modules["scanloom.stages.tiling.tiles"], "ROWS_AT_ONCE", 0)
+    scans, T = world
+    poses = poses_of(T)
+    chunks = [
+        Source("a", f"{i:04}", pieces_of([scan], T[i : i + 1], poses=poses)) for i, scan in enumerate(scans)
+    ]
+    for name, (tile, _) in tiles_of(chunks).items():
+        assert tile.to_arrow().equals(whole[name][0].to_arrow())
