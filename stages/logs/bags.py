@@ -184,7 +184,7 @@ def _opener(name: str) -> Callable[[Path], Container] | None:
     if name.endswith(".zstd"):
         inner = _opener(name.removesuffix(".zstd"))
         return _packed(inner) if inner else None
-    return _OPENERS.get(Path(name).suffix)
+    return _OPENERS.get(Path(name).suffix.lower())
 
 
 def _packed(inner: Callable[[Path], Container]) -> Callable[[Path], Container]:

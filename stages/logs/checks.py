@@ -13,6 +13,7 @@ from scanloom.stages.geometry.se3 import F8
 
 I8 = NDArray[np.int64]
 GRAVITY_M_S2 = 9.80665
+_YEAR_2001_NS = 1_000_000_000_000_000_000
 _LABEL = {"lidar": "The LiDAR", "imu": "The IMU", "gnss": "The GNSS", "wheel": "The wheel speed"}
 _SLOWEST_HZ = {"lidar": 4.0, "imu": 50.0, "gnss": 0.5, "wheel": 5.0}
 _FASTEST_HZ = {"lidar": 41.0, "imu": 4000.0, "gnss": 200.0, "wheel": 2000.0}
@@ -73,7 +74,10 @@ def _pace(role: str, topic: str, stamps: I8, start_ns: int) -> Iterator[Problem]
 def _clock(role: str, topic: str, header_ns: I8, receive_ns: I8, start_ns: int) -> Iterator[Problem]:
     lag = (receive_ns - header_ns) / 1e9
     median = float(np.median(lag))
-    if abs(median) > 1.0:
+    if header_ns.max() < _YEAR_2001_NS < receive_ns.min():
+        text = f"has headers that tell no date; they count from the sensor's start, {_span(header_ns.min() / 1e9)} before"
+        yield _problem(role, "clock", "info", text, topic)
+    elif abs(median) > 1.0:
         text = (
             f"is stamped by another clock than the recorder's: its headers are {_span(abs(median))} "
             f"{'behind' if median > 0 else 'ahead'}"

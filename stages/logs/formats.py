@@ -11,7 +11,7 @@ SCAN_SUFFIXES = (".pcd", ".ply", ".bin")
 
 def detect(names: Sequence[str]) -> str:
     """`rosbag1`, `rosbag2`, `mcap`, `kitti raw`, `kitti odometry`, `point files`, or empty."""
-    paths = [PurePosixPath(name) for name in names]
+    paths = [PurePosixPath(name.lower()) for name in names]
     if any("velodyne_points" in path.parts for path in paths):
         return "kitti raw"
     if any(path.suffix in (".bag", ".active") for path in paths):

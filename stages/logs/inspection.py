@@ -21,6 +21,7 @@ from scanloom.stages.logs.survey import Survey
 from scanloom.stages.logs.sweeps import CloudMessage, ScanMaker
 
 _LOOKED_AT = 3
+_WEIGHT = {"error": 0, "warning": 1, "info": 2}
 _MISSING = {
     "imu": "no IMU: motion within a sweep comes from the scans themselves",
     "gnss": "no GNSS: the map gets no georeference",
@@ -105,7 +106,7 @@ def inspect_log(path: Path, settings: Settings | None = None) -> Inspection:
         missing=tuple(_MISSING[role] for role in _MISSING if role not in used) if "lidar" in used else (),
         extrinsics=session.extrinsics,
         truth=located.truth_log.names,
-        problems=problems,
+        problems=tuple(sorted(problems, key=lambda problem: _WEIGHT[problem.severity])),
         next_step=_next_step(path, session, error),
     )
 

@@ -111,6 +111,13 @@ def check_file(path: Path) -> None:
             where=str(path),
             next_step=f"give {ACCEPTED}",
         )
+    known = next((ending for ending, magics in _MAGICS.items() if head.startswith(magics)), "")
+    if known:
+        raise InvalidInput(
+            f"The name does not say so, but this is a {known} file.",
+            where=str(path),
+            next_step=f"rename it so that it ends in {known}",
+        )
     if suffix not in SCAN_SUFFIXES:
         raise InvalidInput(
             f"This is no log: {_what_it_is(head)}.", where=str(path), next_step=f"give {ACCEPTED}"
