@@ -187,7 +187,9 @@ def _need_xyz(names: dict[str, str]) -> None:
 
 
 def _column(table: NDArray[Any], name: str, dtype: Any) -> NDArray[Any]:
-    return np.ascontiguousarray(table[name], dtype)
+    # A NaN as ring or a number past float32 is the log's affair, not a reason to warn.
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.ascontiguousarray(table[name], dtype)
 
 
 def _first_column(
