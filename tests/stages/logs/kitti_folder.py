@@ -24,7 +24,16 @@ def stored_scan(seed: int = 0, *, columns: int = 360, beams: int = BEAMS) -> tup
             azimuth = azimuth[(azimuth > 0.35) & (azimuth < 5.9)]
         r = rng.uniform(4, 50, len(azimuth))
         flat = r * np.cos(elevation)
-        points.append(np.column_stack((flat * np.cos(azimuth), flat * np.sin(azimuth), r * np.sin(elevation), rng.random(len(azimuth)))))
+        points.append(
+            np.column_stack(
+                (
+                    flat * np.cos(azimuth),
+                    flat * np.sin(azimuth),
+                    r * np.sin(elevation),
+                    rng.random(len(azimuth)),
+                )
+            )
+        )
         rings.append(np.full(len(azimuth), ring))
     return np.concatenate(points).astype("<f4"), np.concatenate(rings)
 

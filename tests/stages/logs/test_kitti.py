@@ -85,7 +85,9 @@ def test_times_run_clockwise_from_the_rear_with_the_stamp_ahead(tmp_path: Path) 
     assert cloud.sweep is not None
     assert cloud.sweep.direction == CLOCKWISE
     share = azimuth_times(cloud, 100_000_000) / 100_000_000
-    np.testing.assert_allclose(share, 0.5 - np.arctan2(points[:, 1].astype(float), points[:, 0]) / (2 * np.pi), atol=1e-5)
+    np.testing.assert_allclose(
+        share, 0.5 - np.arctan2(points[:, 1].astype(float), points[:, 0]) / (2 * np.pi), atol=1e-5
+    )
 
 
 def test_timestamps_of_oxts_stand_in(tmp_path: Path) -> None:
@@ -96,7 +98,12 @@ def test_timestamps_of_oxts_stand_in(tmp_path: Path) -> None:
     assert any("oxts/timestamps.txt" in p.text for p in source.problems)
     (tmp_path / DRIVE / "oxts/timestamps.txt").unlink()
     source = open_kitti(log_of(tmp_path))
-    assert [m.body.stamp_ns for m in source.messages({SCANS, IMU})] == [0, 100_000_000, 200_000_000, 300_000_000]
+    assert [m.body.stamp_ns for m in source.messages({SCANS, IMU})] == [
+        0,
+        100_000_000,
+        200_000_000,
+        300_000_000,
+    ]
     assert codes(source).count("kitti.oxts_no_time") == 1
 
 
