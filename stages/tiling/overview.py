@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scanloom.schemas.errors import StageError
 from scanloom.schemas.product import Parts, columns_of
 from scanloom.schemas.tiles import MapFiles, Tile, TileIndex
+from scanloom.stages.geometry.voxels import downsample
 from scanloom.stages.tiling import ply
 from scanloom.stages.tiling.grid import tile_position
 
@@ -112,9 +113,7 @@ def coarse_picks(tile: Tile, voxel_size_m: float) -> NDArray[np.int64]:
     """Indices of the tile's points that are the first of their coarse voxel, in order."""
     if voxel_size_m <= tile.voxel_size_m:
         return np.arange(len(tile))
-    points = np.column_stack((tile.x_m, tile.y_m, tile.z_m))
-    keys = np.floor(points / voxel_size_m).astype(np.int64) @ np.array([1 << 42, 1 << 21, 1])
-    return np.sort(np.unique(keys, return_index=True)[1])
+    return downsample(np.column_stack((tile.x_m, tile.y_m, tile.z_m)), voxel_size_m)
 
 
 def _vertices(tile: Tile, picks: NDArray[np.int64]) -> bytes:
