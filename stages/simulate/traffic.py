@@ -60,8 +60,9 @@ def build_traffic(settings: Settings, path: Path, motion: Motion) -> list[Actor]
         return []
     rng = np.random.default_rng((settings.seed, 11))
 
-    def follow(lag_s: float) -> Callable[[F8], F8]:
-        return lambda t: np.asarray(motion.arc(t + lag_s), float) + 4.0 * np.sign(lag_s)
+    def follow(lag_s: float, gap_m: float) -> Callable[[F8], F8]:
+        """Drive like the own vehicle, earlier or later; at rest the centres are still `gap_m` apart."""
+        return lambda t: np.asarray(motion.arc(t + lag_s), float) + gap_m
 
     def cruise(start_m: float, speed: float) -> Callable[[F8], F8]:
         return lambda t: start_m + speed * t
@@ -71,8 +72,8 @@ def build_traffic(settings: Settings, path: Path, motion: Motion) -> list[Actor]
         return lambda t: start_m + 12.5 * np.sin(speed / 12.5 * t + phase)
 
     actors = [
-        Actor("truck", truck(), follow(LEAD_S), 0.0),
-        Actor("car behind", car(Material.PAINT_DARK), follow(-2.2), 0.0),
+        Actor("truck", truck(), follow(LEAD_S, 11.0), 0.0),
+        Actor("car behind", car(Material.PAINT_DARK), follow(-2.2, -6.0), 0.0),
     ]
     for k in range(9):
         start = path.length_m * (k + rng.uniform(0.1, 0.9)) / 9
