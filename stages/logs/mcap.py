@@ -148,8 +148,8 @@ class McapFile(ChunkedFile):
                 pass
         lost = len(self._bytes) - at
         self._lose(
-            f"the file ends in the middle of a record, {lost / 1e6:.2g} MB after the last whole one: it was cut at "
-            f"{len(self._bytes) / 1e6:.1f} MB, and what was recorded after that is missing",
+            f"the file was cut at {len(self._bytes) / 1e6:.1f} MB, its last {lost / 1e6:.2g} MB hold only a part of a record, "
+            "and what was recorded after that is missing",
             lost,
         )
 

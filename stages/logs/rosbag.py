@@ -163,8 +163,7 @@ class Rosbag1File(ChunkedFile):
     def _stop(self, at: int, why: str) -> None:
         """Nothing whole follows."""
         size = len(self._bytes)
-        lost = f"{(size - at) / 1e6:.2g} MB after the last whole one"
-        text = f"the file ends in the middle of a record, {lost}: it was cut at {size / 1e6:.1f} MB"
+        text = f"the file was cut at {size / 1e6:.1f} MB, its last {(size - at) / 1e6:.2g} MB hold only a part of a record"
         if why != _CUT:
             text = f"the file is damaged from {at / 1e6:.1f} MB on ({why})"
         self._lose(self._missing(text), size - at)

@@ -36,6 +36,8 @@ from scanloom.stages.logs.sweeps import ScanTally
 I8 = NDArray[np.int64]
 _CLOCK_APART_NS = 1_000_000_000
 _MOST_SHOWN = 4
+_MOST_OF_THE_TIME = 0.9
+_LONG_ENOUGH_NS = 3_000_000_000
 
 
 @dataclass
@@ -263,16 +265,20 @@ class Survey:
 
     def _coverage(self, tally: ScanTally) -> Iterator[Problem]:
         """Sensors that do not measure while the LiDAR does."""
+        span_ns = max(tally.last_ns - tally.first_ns, 1)
         for role in ("imu", "gnss", "wheel"):
-            stamps = self._stamps(role)
-            if (
-                len(stamps)
-                and tally.scans
-                and (stamps.max() < tally.first_ns or stamps.min() > tally.last_ns)
-            ):
-                topic = self.roles.of(role)
+            stamps, topic = self._stamps(role), self.roles.of(role)
+            if not len(stamps) or not tally.scans:
+                continue
+            shared = (
+                min(int(stamps.max()), tally.last_ns) - max(int(stamps.min()), tally.first_ns)
+            ) / span_ns
+            if shared < 0:
                 text = f"{topic} does not overlap the LiDAR's scans in time; check the clocks or ingest.{role}_offset_s."
                 yield Problem(code=f"{role}.no_overlap", severity="warning", text=text, topic=topic)
+            elif shared < _MOST_OF_THE_TIME and span_ns > _LONG_ENOUGH_NS:
+                text = f"{topic} covers only {100 * shared:.0f} % of the time in which the LiDAR measures."
+                yield Problem(code=f"{role}.partial", severity="warning", text=text, topic=topic)
 
     def _topics(self) -> tuple[Topic, ...]:
         return tuple(

@@ -236,6 +236,12 @@ def test_a_sensor_with_its_own_clock_is_shifted_by_receive_times(tmp_path: Path)
     assert "imu.no_overlap" in kept.codes()
 
 
+def test_a_sensor_that_stops_early_is_said(tmp_path: Path) -> None:
+    items = [i for i in drive(ROS2, scans=40) if i.topic != "/imu" or i.receive_ns < START_NS + 2_000_000_000]
+    [problem] = [p for p in run(recorded(tmp_path, items)).session.problems if p.code == "imu.partial"]
+    assert "50 %" in problem.text
+
+
 def test_acceleration_in_units_of_gravity_is_converted(tmp_path: Path) -> None:
     items = [
         Item(i.topic, i.type, i.receive_ns, writing.imu(ROS2, i.receive_ns - 2_000_000, (0, 0, 1.0))) if i.topic == "/imu" else i
