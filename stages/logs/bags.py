@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scanloom.schemas.errors import InvalidInput
 from scanloom.schemas.session import Extrinsic, Problem, RawLog
-from scanloom.stages.logs.containers import Container
+from scanloom.stages.logs.containers import Channel, Container
 from scanloom.stages.logs.database import DatabaseFile
 from scanloom.stages.logs.mcap import McapFile
 from scanloom.stages.logs.messages import decode, kind_of, ros2_name
@@ -23,6 +23,7 @@ from scanloom.stages.logs.records import Damage, Message, TopicInfo
 from scanloom.stages.logs.rosbag import Rosbag1File
 
 _ENCODINGS = ("cdr", "ros1")
+_TF_ALL, _TF_EVERY = 1000, 50
 
 
 @dataclass
@@ -81,13 +82,23 @@ class BagLog:
             and channel.encoding in _ENCODINGS
             and kind_of(channel.type) not in ("other", "images")
         }
+        seen: Counter[int] = Counter()
         for raw in file.read(wanted):
             channel = channels[raw.channel]
+            seen[raw.channel] += 1
+            if _superfluous(channel, seen[raw.channel]):
+                continue
             body = decode(raw.data, channel.type, channel.encoding, channel.topic, raw.receive_ns)
             if body.stamp_ns == 0 and raw.receive_ns:
                 self.unstamped[channel.topic] += 1
                 body = replace(body, stamp_ns=raw.receive_ns)
             yield raw.receive_ns, Message(channel.topic, body)
+
+
+def _superfluous(channel: Channel, number: int) -> bool:
+    """Of transforms sent again and again a sample tells whether they move; decoding all would take minutes an hour."""
+    again = kind_of(channel.type) == "tf" and number > _TF_ALL
+    return again and number % _TF_EVERY != 0
 
 
 def _receive_ns(pair: tuple[int, Message]) -> int:

@@ -81,6 +81,7 @@ class DatabaseFile:
         base = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{mode}", uri=True, check_same_thread=False)
         # a file shorter than its header says is refused otherwise
         base.execute("PRAGMA writable_schema=ON")
+        base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_MESSAGE_BYTES)
         base.text_factory = lambda raw: raw.decode("utf-8", "replace")
         return base
 
