@@ -214,7 +214,8 @@ def _local(workers: int | None, modules: Sequence[str]) -> tuple[Any, Any]:
         threads_per_worker=1,
         processes=True,
         memory_limit=0,
-        dashboard_address=None,
+        dashboard_address="127.0.0.1:0",
+        worker_dashboard_address="127.0.0.1:0",
         silence_logs=logging.CRITICAL,
         host="127.0.0.1",
     )
@@ -227,9 +228,14 @@ def _start_forkserver(modules: Sequence[str]) -> None:
 
     for name, value in THREADS.items():
         os.environ.setdefault(name, value)
-    get_context("forkserver").set_forkserver_preload(
-        ["distributed", "scanloom.pipeline.task", "pyarrow.parquet"]
-    )
+    ours = [
+        "scanloom.pipeline.local_worker",
+        "distributed",
+        "scanloom.pipeline.task",
+        "pyarrow.parquet",
+        "numpy.random",
+    ]
+    get_context("forkserver").set_forkserver_preload([*ours, *modules])
     forkserver.ensure_running()
 
 

@@ -23,6 +23,7 @@ class Order:
     key: str
     identity: Json
     spec: Json
+    inputs: list[Input]
 
 
 class Identifier:
@@ -31,6 +32,7 @@ class Identifier:
     def __init__(self, flow: Flow, store: Store) -> None:
         self._flow = flow
         self._store = store
+        self._stamps: dict[tuple[Path, tuple[str, ...]], dict[str, tuple[int, int]]] = {}
         self._bytes: dict[str | None, int] = {}
         self._circumstances = {"git_commit": git_commit()}
         self._code: dict[str, Json] = {}
@@ -64,7 +66,7 @@ class Identifier:
             "reads": reads,
             "writes": [import_path(product) for product in node.writes],
         }
-        return Order(key, identity, spec)
+        return Order(key, identity, spec, inputs)
 
     def constant(self, task: Task) -> Json:
         """The part of the identity that does not depend on inputs: stage, code, settings."""
@@ -75,13 +77,26 @@ class Identifier:
             "settings": task.settings.model_dump(mode="json"),
         }
 
+    def changed_sources(self, inputs: list[Input]) -> list[str]:
+        """Files from outside that are no longer what the key was made of: somebody is still writing them."""
+        changed: list[str] = []
+        for entry in inputs:
+            for _, ref in entry.parts:
+                if isinstance(ref, Source):
+                    files = ref.session.sources[ref.product]
+                    root = _root(files)
+                    now = {name: _stamp(root / name) for name in files.names}
+                    before = self._stamps.get((root, files.names), now)
+                    changed.extend(str(root / name) for name in files.names if now[name] != before[name])
+        return changed
+
     def session_bytes(self, task: Task) -> int:
         """Size of the files that the task's session brings along; 0 for tasks of the whole map."""
         session = task.session
         if session not in self._bytes:
             sources = self._flow.sessions[session].sources.values() if session is not None else ()
             self._bytes[session] = sum(
-                _size(_root(files) / name) for files in sources for name in files.names
+                _stamp(_root(files) / name)[0] for files in sources for name in files.names
             )
         return self._bytes[session]
 
@@ -104,6 +119,7 @@ class Identifier:
     def _source(self, root: Path, files: Files) -> str:
         mark = (root, files.names)
         if mark not in self._sources:
+            self._stamps[mark] = {name: _stamp(root / name) for name in files.names}
             paths: Mapping[str, Path] = {name: root / name for name in files.names}
             self._sources[mark] = files_digest(self._store.hashes.of(paths))
         return self._sources[mark]
@@ -117,11 +133,13 @@ def _root(files: Files) -> Path:
     return Path(files.root).absolute()
 
 
-def _size(path: Path) -> int:
+def _stamp(path: Path) -> tuple[int, int]:
+    """Size and modification time, ns; (0, 0) when there is no such file."""
     try:
-        return path.stat().st_size
+        found = path.stat()
     except OSError:
-        return 0
+        return 0, 0
+    return found.st_size, found.st_mtime_ns
 
 
 def git_commit() -> str:

@@ -10,7 +10,7 @@ from typing import Self
 import psutil
 
 PERIOD_S = 0.2
-CHILDREN_EVERY = 10
+CHILDREN_EVERY = 5
 """Samples between two looks for new child processes; looking walks all processes of the machine."""
 
 

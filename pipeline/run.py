@@ -20,10 +20,10 @@ from scanloom.pipeline.plan import plan
 from scanloom.pipeline.progress import Progress, Silent
 from scanloom.pipeline.records import RunRecord, forget_failure, record_failure
 from scanloom.pipeline.request import Request
-from scanloom.pipeline.store import Artifact, Store, part_coordinate
+from scanloom.pipeline.store import Artifact, Store, part_coordinate, set_aside
 from scanloom.pipeline.task import Json, describe_error, rebuild_error
 from scanloom.pipeline.upkeep import clean
-from scanloom.schemas.errors import ScanloomError, StoreError
+from scanloom.schemas.errors import InvalidInput, ScanloomError, StoreError
 from scanloom.schemas.product import Coordinate, Parts, Product
 
 __all__ = ["Result", "TaskRecord", "plan", "run"]
@@ -212,11 +212,19 @@ class Driver:
         if outcome is None:
             return
         key, answer = outcome
-        task, _ = self._running.pop(key)
+        task, order = self._running.pop(key)
         if isinstance(answer, BaseException):
             self._fail(task, key, describe_error(unanswered(answer), str(task)))
         elif answer["error"] is not None:
             self._fail(task, key, answer["error"], answer)
+        elif changed := self._identifier.changed_sources(order.inputs):
+            set_aside(self._store, self._store.folder(task.node.name, key))
+            error = InvalidInput(
+                "the file changed while it was read",
+                where=", ".join(changed),
+                next_step="wait until it is complete, then run the same command again",
+            )
+            self._fail(task, key, describe_error(error, str(task)), answer)
         else:
             self._computed(task, key, answer)
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import subprocess
+import sys
 
 import psutil
 import pytest
@@ -56,7 +58,11 @@ def test_a_dead_worker_is_retried_once_and_then_named(tmp_path, store):
 
 def test_workers_are_gone_afterwards_and_have_one_thread(tmp_path, store):
     run(request(log(tmp_path, "a", A)), store, cluster="local", workers=1)
-    assert [p for p in children() if p.status() != psutil.STATUS_ZOMBIE and "resource_tracker" not in str(p.cmdline())] == []
+    assert [
+        p
+        for p in children()
+        if p.status() != psutil.STATUS_ZOMBIE and "resource_tracker" not in str(p.cmdline())
+    ] == []
     assert os.environ["OMP_NUM_THREADS"] == "1"
 
 
@@ -76,9 +82,11 @@ def test_resources_go_to_workers_that_offer_them(tmp_path, store):
     with pytest.raises(UsageError, match="join: no worker offers GPU 1"):
         run(asked, store, cluster="none")
     assert run(asked, store, cluster="tests.pipeline.toys.clusters:threads").executed > 0
-    impossible = tuple(dataclasses.replace(n, resources=(("GPU", 8.0),)) if n.name == "read" else n for n in NODES)
+    impossible = tuple(
+        dataclasses.replace(n, resources=(("GPU", 8.0),)) if n.name == "read" else n for n in NODES
+    )
+    asked = Request(impossible, (log(tmp_path, "b", B),))
     with pytest.raises(UsageError, match="read session=b: no worker offers GPU 8"):
-        asked = Request(impossible, (log(tmp_path, "b", B),))
         run(asked, store, cluster="tests.pipeline.toys.clusters:threads")
 
 
@@ -104,9 +112,9 @@ def test_a_cluster_without_workers_fails_instead_of_waiting(tmp_path, store, mon
     from distributed import LocalCluster
 
     monkeypatch.setattr(cluster, "WORKERS_WITHIN_S", 0.2)
-    with LocalCluster(n_workers=0, processes=False, dashboard_address=None, silence_logs=50) as empty:
-        with pytest.raises(UsageError, match="the cluster has no worker after"):
-            run(request(log(tmp_path, "a", A)), store, cluster=empty.scheduler_address)
+    empty = LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0", silence_logs=50)
+    with empty, pytest.raises(UsageError, match="the cluster has no worker after"):
+        run(request(log(tmp_path, "a", A)), store, cluster=empty.scheduler_address)
 
 
 def test_a_cluster_that_loses_its_workers_fails_instead_of_waiting(tmp_path, store, monkeypatch):
@@ -114,7 +122,23 @@ def test_a_cluster_that_loses_its_workers_fails_instead_of_waiting(tmp_path, sto
     with threads() as started:
         executor = cluster.executor(started.scheduler_address, None)
         started.scale(0)
-        with pytest.raises(ScanloomError, match="the cluster has had no worker"):
-            for _ in range(100):
+        with pytest.raises(ScanloomError, match="the cluster has had no worker"):  # noqa: PT012
+            while True:
                 executor.next(0.1)
         executor.close()
+
+
+def test_nothing_listens_beyond_this_machine():
+    executor = cluster.executor("local", 1)
+    try:
+        family = [psutil.Process(), *psutil.Process().children(recursive=True)]
+        listening = {c.laddr.ip for p in family for c in p.net_connections("inet") if c.status == "LISTEN"}
+    finally:
+        executor.close()
+    assert listening == {"127.0.0.1"}
+
+
+def test_dask_is_not_imported_before_it_is_needed():
+    """The command line must answer at once."""
+    code = "import sys, scanloom.pipeline.run; print(sorted({'dask', 'distributed', 'rich', 'pandas'} & set(sys.modules)))"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "[]\n"

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import importlib
 import os
-import subprocess
 import sys
 import textwrap
 from pathlib import Path
 
 import pytest
 
-from scanloom.pipeline.fingerprint import FileHashes, canonical, code_version, digest, file_digest
+from scanloom.pipeline.fingerprint import (
+    FileHashes,
+    _closure,
+    _imports,
+    _is_module,
+    _module_source,
+    canonical,
+    code_version,
+    digest,
+    file_digest,
+)
 from scanloom.schemas.errors import InvalidInput
-from tests.pipeline.conftest import ROOT
 from tests.pipeline.toys.smooth import smooth
 
 PACKAGE = {
@@ -45,26 +54,15 @@ def plant(tmp_path: Path) -> Path:
 
 
 def fingerprint(plant: Path) -> dict:
-    """In a process of its own, because code is looked at once per process."""
-    code = (
-        "import json; from plant.stage import work; from scanloom.pipeline.fingerprint import code_version;"
-        "print(json.dumps(code_version(work, 1)))"
-    )
-    path = os.pathsep.join([str(plant.parent), str(ROOT)])
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ, "PYTHONPATH": path}
-    )
-    return eval(done.stdout)
-
-
-def test_templates_count_with_their_package(plant):
-    before = fingerprint(plant)
-    (plant / "tools" / "page.html").write_text("<p>")
-    first = fingerprint(plant)
-    (plant / "tools" / "page.html").write_text("<b>")
-    second = fingerprint(plant)
-    assert len({digest(found) for found in (before, first, second)}) == 3
-    assert first["modules"]["plant.tools.near"] == before["modules"]["plant.tools.near"]
+    """As a new process would see it: code is looked at once per process."""
+    for memory in (_closure, _imports, _is_module, _module_source):
+        memory.cache_clear()
+    for name in [name for name in sys.modules if name.partition(".")[0] == "plant"]:
+        del sys.modules[name]
+    importlib.invalidate_caches()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(plant.parent)
+        return code_version(importlib.import_module("plant.stage").work, 1)
 
 
 def test_closure_of_imports(plant):
@@ -86,7 +84,9 @@ def test_closure_of_imports(plant):
 
 def test_closure_reaches_the_products_of_a_toy_stage():
     modules = code_version(smooth, 1)["modules"]
-    assert {"tests.pipeline.toys.helper", "tests.pipeline.toys.products", "scanloom.schemas.product"} <= set(modules)
+    assert {"tests.pipeline.toys.helper", "tests.pipeline.toys.products", "scanloom.schemas.product"} <= set(
+        modules
+    )
     assert "tests.pipeline.toys.cut" not in modules
     assert not any(name.startswith("scanloom.pipeline") for name in modules)
     assert code_version(smooth, 2) != code_version(smooth, 1)

@@ -35,7 +35,9 @@ def test_when_all_is_there_all_is_hit(tmp_path, store):
     asked = request(log(tmp_path, "a", A))
     result = run(asked, store, cluster="none")
     planned = plan(asked, store)
-    assert [(t.node, t.coordinate, t.key) for t in planned] == [(t.node, t.coordinate, t.key) for t in result.tasks]
+    assert [(t.node, t.coordinate, t.key) for t in planned] == [
+        (t.node, t.coordinate, t.key) for t in result.tasks
+    ]
     assert {task.verdict for task in planned} == {"HIT"}
 
 

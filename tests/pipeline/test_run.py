@@ -7,17 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from scanloom.pipeline import fingerprint
-from scanloom.pipeline.node import node
-from scanloom.pipeline.plan import Request, SessionInput, plan
+from scanloom.pipeline.plan import Request, SessionInput
 from scanloom.pipeline.run import run
-from scanloom.pipeline.store import Store
 from scanloom.schemas.errors import EXIT_INVALID_INPUT, InvalidInput, ScanloomError, StageError, UsageError
 from tests.pipeline.reading import contents, leftovers, record, verdicts
 from tests.pipeline.toys import join as join_module
 from tests.pipeline.toys import smooth as smooth_module
 from tests.pipeline.toys.products import Overview, Piece, Shift, Smooth, Summary, Tile, TileText, Track
-from tests.pipeline.toys.workflow import NODES, log, request
+from tests.pipeline.toys.workflow import log, request
 
 A = range(30)
 B = range(10, 35)
@@ -107,7 +104,9 @@ def test_a_session_may_have_its_own_settings(tmp_path, store):
     run(request(a, b), store, cluster="none")
     own = dataclasses.replace(b, settings={"smooth": {"step": 5}})
     result = run(request(a, own), store, cluster="none")
-    assert {t.coordinate["session"] for t in result.tasks if t.node == "smooth" and t.verdict == "RUN"} == {"b"}
+    assert {t.coordinate["session"] for t in result.tasks if t.node == "smooth" and t.verdict == "RUN"} == {
+        "b"
+    }
     changed = record(result, "track", session="b")
     assert (changed.verdict, changed.reason) == ("RUN", "input smooth changed")
 
@@ -116,7 +115,9 @@ def test_a_new_session_leaves_the_old_ones_alone(tmp_path, store):
     a, b = log(tmp_path, "a", A), log(tmp_path, "b", B)
     run(request(a), store, cluster="none")
     result = run(request(a, b), store, cluster="none")
-    assert {t.node for t in result.tasks if t.verdict == "RUN" and t.coordinate.get("session") == "a"} == set()
+    assert {
+        t.node for t in result.tasks if t.verdict == "RUN" and t.coordinate.get("session") == "a"
+    } == set()
     assert record(result, "join").reason == "input info changed; input track changed"
 
 
@@ -210,7 +211,12 @@ def test_a_failed_map_task_skips_what_follows(tmp_path, store, monkeypatch):
 
 def test_when_no_session_is_left_the_map_is_skipped(tmp_path, store):
     result = run(request(log(tmp_path, "bad", A, "broken")), store, cluster="none")
-    assert verdicts(result) == {"read": {"FAILED": 1}, "track": {"SKIPPED": 1}, "join": {"SKIPPED": 1}, "survey": {"SKIPPED": 1}}
+    assert verdicts(result) == {
+        "read": {"FAILED": 1},
+        "track": {"SKIPPED": 1},
+        "join": {"SKIPPED": 1},
+        "survey": {"SKIPPED": 1},
+    }
     assert record(result, "join").reason == "no session is left"
 
 
@@ -237,6 +243,14 @@ def test_a_missing_log_fails_its_session(tmp_path, store):
     result = run(request(a, b), store, cluster="none")
     assert isinstance(result.failures[0].error, InvalidInput)
     assert "log.txt" in str(result.failures[0].error)
+    assert result.parts(Summary)[0].sessions == ("b",)
+
+
+def test_a_log_that_is_still_being_written_fails_its_session(tmp_path, store):
+    result = run(request(log(tmp_path, "a", A, "growing"), log(tmp_path, "b", B)), store, cluster="none")
+    assert isinstance(result.failures[0].error, InvalidInput)
+    assert "log.txt: the file changed while it was read" in str(result.failures[0].error)
+    assert store.find("read", result.failures[0].key) is None
     assert result.parts(Summary)[0].sessions == ("b",)
 
 

@@ -43,5 +43,7 @@ def test_what_is_wrong_is_named(layer, message):
 
 
 def test_the_layer_at_fault_is_the_last_that_sets_the_field():
-    with pytest.raises(UsageError, match="command line: settings.smooth.step = 99"):
-        resolve(NODES, [("project.yaml", {"smooth": {"step": 2}}), ("command line", {"smooth": {"step": 99}})])
+    with pytest.raises(UsageError, match=r"command line: settings\.smooth\.step = 99"):
+        resolve(
+            NODES, [("project.yaml", {"smooth": {"step": 2}}), ("command line", {"smooth": {"step": 99}})]
+        )

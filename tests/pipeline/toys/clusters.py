@@ -13,7 +13,7 @@ def threads() -> Any:
         n_workers=1,
         threads_per_worker=1,
         processes=False,
-        dashboard_address=None,
+        dashboard_address="127.0.0.1:0",
         resources={"GPU": 1},
         silence_logs=50,
     )

@@ -42,6 +42,8 @@ def _obey(words: list[str], root: Path | None) -> None:
         with (root / "deaths").open("a") as deaths:
             deaths.write("x")
         os._exit(9)
+    if "growing" in words and root is not None:
+        (root / "log.txt").write_text(" ".join([*words, "1"]))
     if "once" in words and root is not None and not (root / "died").exists():
         (root / "died").touch()
         os._exit(9)
