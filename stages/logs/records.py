@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
 from scanloom.schemas.session import Extrinsic, Problem
 from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.geometry.sweep import Sweep
