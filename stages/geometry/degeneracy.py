@@ -106,8 +106,8 @@ def scan_covariance(
     inside = seen.directions.T @ (predicted / scale[:, None] / scale) @ seen.directions
     strong = seen.p >= least_p
     inside = np.where(strong[:, None] | strong, 0.0, inside)
-    known = inflation * sigma2 / np.maximum(seen.eigenvalues, EIGENVALUE_FLOOR)
-    inside = inside + np.diag(np.where(strong, known, 0.0))
+    known = np.where(strong, seen.eigenvalues, np.inf)
+    inside = inside + np.diag(inflation * min(sigma2, BLIND_STD_M**2) / np.maximum(known, EIGENVALUE_FLOOR))
     covariance = (seen.directions @ inside @ seen.directions.T) * scale[:, None] * scale
     covariance = covariance + np.diag([floor_rad**2] * 3 + [floor_m**2] * 3)
     symmetric: F8 = 0.5 * (covariance + covariance.T)

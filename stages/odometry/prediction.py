@@ -10,6 +10,7 @@ from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.stages.geometry.motion import MotionTrack
 from scanloom.stages.geometry.se3 import F8, inverse, se3_exp, se3_log
+from scanloom.stages.odometry.slip import SlipGate
 
 GYRO_STD_RAD_PER_SQRT_S = 0.002
 WHEEL_STD_SHARE = 0.02
@@ -41,7 +42,7 @@ class Predictor:
     """Expected motion between scans.
 
     Rotation from the gyro and translation from the wheels where they cover the time, else both at the rate of the
-    last registered motion. The wheels' scale is estimated from well registered scans: the ratio of sums of LiDAR and
+    last registered motion. What the wheels say is bounded by the accelerometer. Their scale is estimated from well registered scans: the ratio of sums of LiDAR and
     wheel displacement along x of the base, with a prior of 1 and a memory of some hundred metres; steps where the two
     differ by more than 0.5 m/s are slip and left out (methods 1.8).
     """
@@ -51,6 +52,7 @@ class Predictor:
         self._T_base_lidar = np.array(session.T_base("lidar"))
         self._twist: F8 | None = None
         self._seen_ns: int | None = None
+        self._gate = SlipGate(session, imu)
         self._lidar_m = self._wheel_m = SCALE_PRIOR_M
 
     @property
@@ -62,9 +64,11 @@ class Predictor:
         """Motion of the LiDAR between two reference times."""
         cover = self._track.covers(last_ns, now_ns)
         T = self._track.relative(last_ns, now_ns, self._twist)
+        slip_m = 0.0
         if cover.translation:
-            T = self._scaled(T)
+            T, slip_m = self._corrected(T, last_ns, now_ns)
         covariance = self._covariance(T, last_ns, now_ns, cover.rotation, cover.translation)
+        covariance[3:, 3:] += np.eye(3) * slip_m**2
         steady = T if self._twist is None else se3_exp(self._twist * 1e-9 * (now_ns - last_ns))
         return Prediction(T, steady, covariance, self._twist is not None or cover.translation)
 
@@ -74,6 +78,7 @@ class Predictor:
         if dt <= 0:
             return
         self._twist = se3_log(T_last_now) / dt
+        self._gate.learn(self._forward(T_last_now) / dt, last_ns, now_ns, well_seen=well_seen)
         if well_seen:
             self._seen_ns = now_ns
         if well_seen and self._track.covers(last_ns, now_ns).translation:
@@ -94,11 +99,14 @@ class Predictor:
         """Displacement of the base origin along x of the base."""
         return float((self._T_base_lidar @ T_lidar @ inverse(self._T_base_lidar))[0, 3])
 
-    def _scaled(self, T_lidar: F8) -> F8:
+    def _corrected(self, T_lidar: F8, last_ns: int, now_ns: int) -> tuple[F8, float]:
+        """The wheels' motion with their scale, without slip; and how much slip was taken off, m."""
         T_base = self._T_base_lidar @ T_lidar @ inverse(self._T_base_lidar)
         T_base[:3, 3] *= self.wheel_scale
-        T: F8 = inverse(self._T_base_lidar) @ T_base @ self._T_base_lidar
-        return T
+        dt = 1e-9 * (now_ns - last_ns)
+        slip_m = float(T_base[0, 3] - self._gate.bounded(T_base[0, 3] / dt, last_ns, now_ns) * dt)
+        T_base[0, 3] -= slip_m
+        return inverse(self._T_base_lidar) @ T_base @ self._T_base_lidar, slip_m
 
     def _covariance(self, T: F8, last_ns: int, now_ns: int, rotation: bool, translation: bool) -> F8:
         """Independent errors of rotation and translation, isotropic, growing with time and way.
