@@ -109,6 +109,7 @@ class Flow:
         self._readers = {n.name: [r for r in self.nodes if self._reads_from(r, n)] for n in self.nodes}
         self._common = resolve(self.nodes, [("settings", request.settings)])
         self._own = {s.name: session_settings(request, s) for s in request.sessions}
+        self._applies = {node.name: _scopes(node, request.sessions) for node in self.nodes}
         self._groups: dict[tuple[str, str | None], Group] = {}
         for node in self.nodes:
             for scope in self._scopes(node):
@@ -152,9 +153,7 @@ class Flow:
     # --- who provides what ------------------------------------------------------------------------------------------
 
     def _scopes(self, node: Node) -> list[str | None]:
-        if "session" not in node.axes:
-            return [None]
-        return [name for name, s in self.sessions.items() if node.only is None or node.only in s.tags]
+        return self._applies[node.name]
 
     def _reads_from(self, reader: Node, writer: Node) -> bool:
         return any(self.writers.get(product) is writer for product in reader.reads)
@@ -162,11 +161,9 @@ class Flow:
     def _provider(self, product: type[Product], session: str | None) -> Node | None:
         """Node that writes `product` for this session; None when the session brings it along."""
         writer = self.writers.get(product)
-        if writer is None or (
-            session is not None and "session" in writer.axes and session not in self._scopes(writer)
-        ):
-            return None
-        return writer
+        if writer is None or writer.only is None or session is None:
+            return writer
+        return writer if (writer.name, session) in self._groups else None
 
     def providers(self, task: Task, product: type[Product]) -> list[tuple[Node | None, str | None]]:
         """(node, session) of everything that a task reads as `product`; node None stands for the session's files."""
@@ -377,6 +374,13 @@ class Flow:
                 found.append(((("session", session),), Source(self.sessions[session], product)))
         found.extend(_parts(product, self.above(task, product)))
         return found
+
+
+def _scopes(node: Node, sessions: Iterable[SessionInput]) -> list[str | None]:
+    """Sessions a node runs for; one None for a node without session axis."""
+    if "session" not in node.axes:
+        return [None]
+    return [session.name for session in sessions if node.only is None or node.only in session.tags]
 
 
 def _parts(product: type[Product], tasks: Iterable[Task]) -> Iterator[tuple[Coordinate, Ref]]:
