@@ -180,6 +180,8 @@ class Stream(Product, Generic[ItemT]):
         return iter(self._items)
 
     def __len__(self) -> int:
+        if not isinstance(self._items, _FileItems | Sequence):
+            raise TypeError(f"{type(self).__name__} is still a generator and has no length")
         return len(self.index)
 
     @property
@@ -231,6 +233,8 @@ class _FileItems:
         self.index = index
 
     def __len__(self) -> int:
+        if not isinstance(self._items, _FileItems | Sequence):
+            raise TypeError(f"{type(self).__name__} is still a generator and has no length")
         return len(self.index)
 
     def __iter__(self) -> Iterator[Any]:

@@ -44,6 +44,18 @@ class Settings(BaseModel):
     high_deg: float = Field(15.0, ge=0.0, le=60.0, description="elevation of the highest beam, deg")
     max_range_m: float = Field(100.0, ge=10.0, le=300.0, description="range beyond which nothing is seen, m")
     range_noise_m: float = Field(0.02, ge=0.0, le=0.5, description="standard deviation of a range, m")
+    beam_range_error_m: float = Field(
+        0.012,
+        ge=0.0,
+        le=0.2,
+        description="standard deviation of the zero of a beam's range, unknown to the user, m",
+    )
+    beam_angle_error_deg: float = Field(
+        0.04,
+        ge=0.0,
+        le=1.0,
+        description="standard deviation of a beam's direction, each axis, unknown to the user, deg",
+    )
     dropout: float = Field(0.02, ge=0.0, le=0.9, description="share of returns lost by chance")
     outliers: float = Field(2e-4, ge=0.0, le=0.1, description="share of returns at a wrong range")
 
@@ -62,6 +74,10 @@ class Settings(BaseModel):
     wheel_slip: float = Field(
         0.25, ge=0.0, le=1.0, description="excess of the wheel speed at the height of a slip"
     )
+    imu_clock_s: float = Field(
+        0.003, ge=-0.1, le=0.1, description="error of the clock that stamps the IMU, s"
+    )
+    wheel_clock_s: float = Field(0.015, ge=-0.1, le=0.1, description="delay of the wheel speed on its bus, s")
     stamp_jitter_s: float = Field(1e-4, ge=0.0, le=0.01, description="error of IMU and wheel stamps, s")
 
     gnss: bool = Field(True, description="a GNSS receiver is on board")

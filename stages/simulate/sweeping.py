@@ -66,8 +66,14 @@ class Lidar:
         self._own, self._own_material = scene_of(vehicle()), vehicle().material
         elevation = np.radians(np.linspace(settings.low_deg, settings.high_deg, settings.beams))
         azimuth = np.pi - 2 * np.pi * np.arange(settings.columns) / settings.columns
-        a, e = np.repeat(azimuth, settings.beams), np.tile(elevation, settings.columns)
-        self._rays = np.column_stack((np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)))
+        self._rays = _rays(azimuth, elevation)
+        # No laser points exactly where its data sheet says, nor measures from exactly the same zero.
+        rng = np.random.default_rng((settings.seed, 20))
+        skew = np.radians(settings.beam_angle_error_deg) * rng.standard_normal((2, settings.beams))
+        self._true_rays = _rays(azimuth[:, None] + skew[0], elevation + skew[1])
+        self._offset = np.tile(
+            settings.beam_range_error_m * rng.standard_normal(settings.beams), settings.columns
+        )
         self._ring = np.tile(np.arange(settings.beams, dtype=np.uint16), settings.columns)
         self._column = np.repeat(np.arange(settings.columns), settings.beams)
         self._own_echo = self._see_own_vehicle()
@@ -75,7 +81,7 @@ class Lidar:
     def sweeps(self) -> Iterator[Sweep]:
         """All sweeps of the log in order; several are cast at once, which changes nothing but the time it takes."""
         s = self._settings
-        count = int(round(s.duration_s * s.rate_hz))
+        count = round(s.duration_s * s.rate_hz)
         batch = max(1, BATCH_RAYS // len(self._rays))
         for first in range(0, count, batch):
             indices = range(first, min(first + batch, count))
@@ -84,7 +90,7 @@ class Lidar:
             T = self._motion.poses(times.ravel()) @ T_BASE["lidar"]
             T = T.reshape(len(indices), s.columns, 4, 4)
             origin = np.repeat(T[..., :3, 3], s.beams, axis=1)
-            rays = self._rays.reshape(s.columns, s.beams, 3)
+            rays = self._true_rays.reshape(s.columns, s.beams, 3)
             direction = np.einsum("kcij,cbj->kcbi", T[..., :3, :3], rays).reshape(len(indices), -1, 3)
             echoes = self._cast_town(origin, direction)
             for k, index in enumerate(indices):
@@ -134,7 +140,7 @@ class Lidar:
     def _see_own_vehicle(self) -> tuple[NDArray[np.int64], NDArray[Any], NDArray[Any], NDArray[Any]]:
         """Own roof and bonnet, the same in every sweep: rays, ranges, cosines, materials."""
         T = T_BASE["lidar"]
-        rays = np.column_stack((np.broadcast_to(T[:3, 3], self._rays.shape), self._rays @ T[:3, :3].T))
+        rays = np.column_stack((np.broadcast_to(T[:3, 3], self._rays.shape), self._true_rays @ T[:3, :3].T))
         hit = cast(self._own, rays.astype(np.float32))
         rows = np.flatnonzero(np.isfinite(hit["range"]))
         return (
@@ -184,7 +190,7 @@ class Lidar:
         s = self._settings
         n = len(echo.range_m)
         noise, chance, shade = rng.standard_normal(n), rng.random((3, n)), rng.standard_normal(n)
-        measured = echo.range_m.astype(float) + s.range_noise_m * noise
+        measured = echo.range_m.astype(float) + self._offset + s.range_noise_m * noise
         stray = chance[0] < s.outliers
         measured[stray] = MIN_RANGE_M + (s.max_range_m - MIN_RANGE_M) * chance[1, stray]
         measured = np.round(measured / RESOLUTION_M) * RESOLUTION_M
@@ -198,7 +204,7 @@ class Lidar:
         time_s = times[self._column[rows]] - start_s
         return Sweep(
             index=index,
-            start_ns=s.start_s * 1_000_000_000 + int(round(start_s * 1e9)),
+            start_ns=s.start_s * 1_000_000_000 + round(start_s * 1e9),
             xyz=(self._rays[rows] * measured[rows, None]).astype(np.float32),
             intensity=np.round(intensity[rows], 1).astype(np.float32),
             ring=self._ring[rows],
@@ -206,6 +212,12 @@ class Lidar:
             kind=kind[rows],
             instance=echo.instance[rows],
         )
+
+
+def _rays(azimuth: F8, elevation: F8) -> F8:
+    """Unit directions (columns * beams, 3), column by column; azimuths (columns,) or (columns, beams) rad."""
+    a, e = np.broadcast_arrays(azimuth if azimuth.ndim == 2 else azimuth[:, None], elevation)
+    return np.stack((np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)), axis=-1).reshape(-1, 3)
 
 
 def scene_of(mesh: Mesh) -> Any:

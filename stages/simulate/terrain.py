@@ -101,7 +101,8 @@ def embankment(x: F8) -> F8:
 def height(x: ArrayLike, y: ArrayLike) -> F8:
     """Height of the ground, m: relief, plateau in the north, ramps, underpass, road camber and kerbs."""
     x, y = np.asarray(x, float), np.asarray(y, float)
-    plateau = RISE_M * smoothstep((y - 100) / 45)
+    gentle = 60 * smoothstep((x - 112) / 70)
+    plateau = RISE_M * smoothstep((y - 100 + gentle) / (45 + gentle))
     south, north = y < OPENING[0], y > OPENING[1]
     ramp = np.where(south, RISE_M * smoothstep((y - 8) / 68), np.where(north, RISE_M, 0.0))
     on_ramp = embankment(x) * (south | north) * (y > 0)

@@ -57,10 +57,10 @@ def _times(settings: Settings, rate_hz: int) -> F8:
     return np.arange(int(settings.duration_s * rate_hz)) / rate_hz
 
 
-def _stamps(settings: Settings, t: F8, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Header stamps: the true time with a jitter that never changes the order."""
+def _stamps(settings: Settings, t: F8, rng: np.random.Generator, late_s: float = 0.0) -> NDArray[np.int64]:
+    """Header stamps: the true time, late by a constant, with a jitter that never changes the order."""
     jitter = np.clip(settings.stamp_jitter_s * rng.standard_normal(len(t)), -0.002, 0.002)
-    return settings.start_s * 1_000_000_000 + np.round((t + jitter) * 1e9).astype(np.int64)
+    return settings.start_s * 1_000_000_000 + np.round((t + jitter + late_s) * 1e9).astype(np.int64)
 
 
 def imu_track(settings: Settings, motion: Motion) -> ImuTrack:
@@ -73,7 +73,7 @@ def imu_track(settings: Settings, motion: Motion) -> ImuTrack:
     rate, change = motion.body_rates(t)
     lever, R_base_imu = T_BASE["imu"][:3, 3], T_BASE["imu"][:3, :3]
     R = motion.poses(t)[:, :3, :3]
-    force = np.einsum("nji,nj->ni", R, motion.acceleration(t) + [0, 0, GRAVITY_M_S2])
+    force = np.einsum("nji,nj->ni", R, motion.acceleration(t) + np.array([0, 0, GRAVITY_M_S2]))
     force = force + np.cross(change, lever) + np.cross(rate, np.cross(rate, lever))
     step = 1 / np.sqrt(IMU_HZ)
 
@@ -86,7 +86,7 @@ def imu_track(settings: Settings, motion: Motion) -> ImuTrack:
     accel = force @ R_base_imu + wander(settings.accel_bias_m_s2, settings.accel_walk_m_s2)
     gyro = gyro + settings.gyro_noise_rad_s * rng.standard_normal(gyro.shape)
     accel = accel + settings.accel_noise_m_s2 * rng.standard_normal(accel.shape)
-    return ImuTrack(t, _stamps(settings, t, rng), gyro, accel)
+    return ImuTrack(t, _stamps(settings, t, rng, settings.imu_clock_s), gyro, accel)
 
 
 def wheel_track(settings: Settings, motion: Motion) -> WheelTrack:
@@ -102,7 +102,7 @@ def wheel_track(settings: Settings, motion: Motion) -> WheelTrack:
     speed = true * (
         1 + settings.wheel_scale + slip
     ) + moving * settings.wheel_noise_m_s * rng.standard_normal(len(t))
-    return WheelTrack(t, _stamps(settings, t, rng), np.round(speed, 3) * moving)
+    return WheelTrack(t, _stamps(settings, t, rng, settings.wheel_clock_s), np.round(speed, 3) * moving)
 
 
 def gnss_track(settings: Settings, motion: Motion, scene: Any) -> GnssTrack:
