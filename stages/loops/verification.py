@@ -114,10 +114,10 @@ def verify(settings: VerificationSettings, c: Candidate, path_m: float, i: Subma
     if not proposals:
         return _rejected("nothing upright to compare")
     maps = _Maps(i)
-    tried = [_refine(maps, j, h) for h in proposals]
+    tried = [_rough(maps, j, h) for h in proposals]
     fits = [_upright_fit(settings, maps, j, r) for r in tried]
     best = int(np.argmax(fits))
-    verdict = _judge(settings, c, path_m, i, j, maps, tried[best])
+    verdict = _judge(settings, c, path_m, i, j, maps, _fine(maps.fine, j, tried[best].T_target_source))
     if not verdict.reason:
         verdict = replace(verdict, reason=_ambiguous(settings, tried, fits, best))
     return verdict
@@ -127,7 +127,7 @@ def _upright_fit(settings: VerificationSettings, maps: _Maps, j: Submap, r: Regi
     """Share of the upright points of j that find a partner."""
     upright = _upright(j)
     thin = upright[downsample(upright, 0.8)]
-    if not r.converged or not len(thin):
+    if not len(thin):
         return 0.0
     return float(_inliers(maps.fine, transform(r.T_target_source, thin), settings.inlier_distance_m).mean())
 
@@ -172,11 +172,12 @@ class _Maps:
         self.fine.insert(submap.points)
 
 
-def _refine(maps: _Maps, j: Submap, h: Hypothesis) -> Registration:
-    rough = align(maps.coarse, _thin(j, 1.5), h.T_i_j, max_distance_m=2.0, scale_m=0.6, max_iterations=15)
-    return align(
-        maps.fine, _thin(j, 0.8), rough.T_target_source, max_distance_m=0.8, scale_m=0.15, max_iterations=20
-    )
+def _rough(maps: _Maps, j: Submap, h: Hypothesis) -> Registration:
+    return align(maps.coarse, _thin(j, 1.5), h.T_i_j, max_distance_m=2.0, scale_m=0.6, max_iterations=15)
+
+
+def _fine(target: VoxelMap, source: Submap, T: F8) -> Registration:
+    return align(target, _thin(source, 0.8), T, max_distance_m=0.8, scale_m=0.15, max_iterations=20)
 
 
 def _thin(submap: Submap, voxel_size_m: float) -> F8:
@@ -273,7 +274,7 @@ def _one_sided(settings: VerificationSettings, i: Submap, j: Submap, T: F8) -> s
     """Registration of i to j must give the inverse."""
     other = VoxelMap(1.0, 20)
     other.insert(j.points)
-    back = align(other, _thin(i, 0.8), inverse(T), max_distance_m=0.8, scale_m=0.15, max_iterations=20)
+    back = _fine(other, i, inverse(T))
     difference = se3_log(T @ back.T_target_source)
     turn, shift = float(np.degrees(np.linalg.norm(difference[:3]))), float(np.linalg.norm(difference[3:]))
     if not back.converged or shift > settings.max_disagreement_m or turn > settings.max_disagreement_deg:
