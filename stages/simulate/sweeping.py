@@ -91,7 +91,7 @@ class Lidar:
             T = T.reshape(len(indices), s.columns, 4, 4)
             origin = np.repeat(T[..., :3, 3], s.beams, axis=1)
             rays = self._true_rays.reshape(s.columns, s.beams, 3)
-            direction = np.einsum("kcij,cbj->kcbi", T[..., :3, :3], rays).reshape(len(indices), -1, 3)
+            direction = (rays @ np.swapaxes(T[..., :3, :3], -1, -2)).reshape(len(indices), -1, 3)
             echoes = self._cast_town(origin, direction)
             for k, index in enumerate(indices):
                 yield self._sweep(index, float(starts[k]), times[k], origin[k], direction[k], echoes, k)
@@ -169,8 +169,8 @@ class Lidar:
                 continue
             columns, inverse_of = np.unique(self._column[rows], return_inverse=True)
             T = inverse(actor.poses(self._town.path, times[columns]))[inverse_of]
-            o = np.einsum("nij,nj->ni", T[:, :3, :3], origin[rows]) + T[:, :3, 3]
-            d = np.einsum("nij,nj->ni", T[:, :3, :3], direction[rows])
+            o = (T[:, :3, :3] @ origin[rows, :, None])[..., 0] + T[:, :3, 3]
+            d = (T[:, :3, :3] @ direction[rows, :, None])[..., 0]
             hit = cast(scene, np.concatenate((o, d), axis=1).astype(np.float32))
             seen = np.flatnonzero(np.isfinite(hit["range"]))
             made_of = material[hit["triangle"][seen].astype(int)]
