@@ -233,8 +233,6 @@ class _FileItems:
         self.index = index
 
     def __len__(self) -> int:
-        if not isinstance(self._items, _FileItems | Sequence):
-            raise TypeError(f"{type(self).__name__} is still a generator and has no length")
         return len(self.index)
 
     def __iter__(self) -> Iterator[Any]:

@@ -30,7 +30,7 @@ def _cache_folder() -> Path:
 
 
 CACHE_FOLDER = _cache_folder()
-numba.config.CACHE_DIR = str(CACHE_FOLDER)  # type: ignore[attr-defined]
+numba.config.CACHE_DIR = str(CACHE_FOLDER)
 
 
 def kernel(function: F) -> F:
