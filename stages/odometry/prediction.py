@@ -34,6 +34,8 @@ class Prediction:
     T_last_now: F8
     steady: F8
     covariance: F8
+    measured: bool
+    """True when gyro and wheels cover the time: then a scan must see a direction clearly to overrule them."""
     known: bool
     """False when neither sensors nor earlier scans tell anything."""
 
@@ -42,9 +44,9 @@ class Predictor:
     """Expected motion between scans.
 
     Rotation from the gyro and translation from the wheels where they cover the time, else both at the rate of the
-    last registered motion. What the wheels say is bounded by the accelerometer. Their scale is estimated from well registered scans: the ratio of sums of LiDAR and
-    wheel displacement along x of the base, with a prior of 1 and a memory of some hundred metres; steps where the two
-    differ by more than 0.5 m/s are slip and left out (methods 1.8).
+    last registered motion. What the wheels say is bounded by the accelerometer. Their scale is estimated from well
+    registered scans: the ratio of sums of LiDAR and wheel displacement along x of the base, with a prior of 1 and a
+    memory of some hundred metres; steps where the two differ by more than 0.5 m/s are slip and left out (methods 1.8).
     """
 
     def __init__(self, session: Session, imu: Imu, wheel: Wheel) -> None:
@@ -70,7 +72,8 @@ class Predictor:
         covariance = self._covariance(T, last_ns, now_ns, cover.rotation, cover.translation)
         covariance[3:, 3:] += np.eye(3) * slip_m**2
         steady = T if self._twist is None else se3_exp(self._twist * 1e-9 * (now_ns - last_ns))
-        return Prediction(T, steady, covariance, self._twist is not None or cover.translation)
+        measured = cover.rotation and cover.translation
+        return Prediction(T, steady, covariance, measured, self._twist is not None or cover.translation)
 
     def learn(self, last_ns: int, now_ns: int, T_last_now: F8, *, well_seen: bool) -> None:
         """Take note of the motion that was found; `well_seen`: along every direction by the scan itself."""

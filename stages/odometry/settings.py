@@ -55,6 +55,18 @@ class Settings(BaseModel):
         le=1.0,
         description="directions observed with less probability are taken from the prediction",
     )
+    snr: float = Field(
+        10.0,
+        ge=0.0,
+        le=1e4,
+        description="a direction is observed when information exceeds that of noise this much",
+    )
+    measured_snr: float = Field(
+        30.0,
+        ge=0.0,
+        le=1e4,
+        description="the same where gyro and wheels tell the motion and a scan would overrule them",
+    )
     point_noise_m: float = Field(0.02, ge=0.001, le=1.0, description="noise of a point, m")
     covariance_inflation: float = Field(
         4.0, ge=0.1, le=1000.0, description="factor on sigma^2 / lambda: residuals share the map's errors"

@@ -92,7 +92,8 @@ class Tracker:
         if len(coarse) < MIN_POINTS or len(self.map) < MIN_POINTS:
             return Found.nothing(prediction)
         registration = self._align_from(prediction, coarse)
-        seen = judge(registration, point_noise_m=self.settings.point_noise_m)
+        snr = self.settings.measured_snr if prediction.measured else self.settings.snr
+        seen = judge(registration, point_noise_m=self.settings.point_noise_m, snr=snr)
         weak = seen.p < self.settings.least_p
         if weak.any():
             registration = self._align(
