@@ -46,13 +46,13 @@ class Settings(BaseModel):
         description="upper corner of the own vehicle in the base frame, m; it never reaches above the LiDAR",
     )
     outlier_neighbours: int = Field(
-        3, ge=0, le=50, description="a point with fewer neighbours is an outlier, number; 0 keeps all"
+        2, ge=0, le=50, description="a point with fewer neighbours is an outlier, number; 0 keeps all"
     )
     outlier_radius_m: float = Field(
         0.2, ge=0.01, le=5.0, description="radius in which neighbours count, at least, m"
     )
     outlier_steps: float = Field(
-        3.0,
+        4.0,
         ge=0.5,
         le=20.0,
         description="radius in which neighbours count, in azimuth steps of the sensor, number",

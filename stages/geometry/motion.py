@@ -199,7 +199,7 @@ def _chain(half: F8, moved: F8, T: F8) -> None:
 
 
 def standstill_intervals(
-    wheel_ns: I8, speed_m_s: F8, imu_ns: I8, gyro: F8, accel: F8, *, least_s: float = 1.0
+    wheel_ns: I8, speed_m_s: F8, imu_ns: I8, gyro: F8, accel: F8, *, least_s: float = 0.8
 ) -> I8:
     """Intervals (k, 2), ns, in which the vehicle stood for more than `least_s`.
 

@@ -18,7 +18,9 @@ from scanloom.stages.geometry.registration import Registration, VoxelMap, align
 from scanloom.stages.geometry.se3 import F8, se3_log
 from scanloom.stages.geometry.voxels import downsample
 
-VOXEL_M = 1.0
+DENSE_POINTS = 8000
+FINE_VOXEL_M, COARSE_VOXEL_M = 1.0, 2.0
+"""Scans with fewer points than `DENSE_POINTS` after thinning need wider surfaces: their beams are far apart."""
 POINTS_PER_VOXEL = 20
 TARGET_SPACING_M = 0.3
 SOURCE_SPACING_M = 1.0
@@ -29,7 +31,7 @@ FINE_SCALE_M, FINE_STEPS = 0.15, 4
 MOST_PASSES = 4
 SETTLED_M_S = 1.0  # a guess wrong by this leaves an error of about 2 % of it
 SETTLED_RAD_S = 0.1
-LEAST_INLIERS = 100
+LEAST_INLIERS = 60
 LEAST_INLIER_SHARE = 0.6  # of the points that have a partner; scans that do not belong together reach 0.4
 LONGEST_PAUSE_S = 0.5
 FASTEST_M_S = 70.0
@@ -94,11 +96,12 @@ def _first_guess(a: ThinScan, b: ThinScan, track: MotionTrack) -> F8:
 def _register(
     a: ThinScan, b: ThinScan, track: MotionTrack, twist: F8, scale_m: float, iterations: int
 ) -> Registration:
-    target = VoxelMap(VOXEL_M, POINTS_PER_VOXEL)
+    voxel_m = FINE_VOXEL_M if len(a.dense) > DENSE_POINTS else COARSE_VOXEL_M
+    target = VoxelMap(voxel_m, POINTS_PER_VOXEL)
     target.insert(_compensated(a.dense, track, twist))
     return align(
         target, _compensated(b.sparse, track, twist), track.relative(a.reference_ns, b.reference_ns, twist),
-        max_distance_m=VOXEL_M, scale_m=scale_m, max_iterations=iterations,
+        max_distance_m=voxel_m, scale_m=scale_m, max_iterations=iterations,
     )  # fmt: skip
 
 
