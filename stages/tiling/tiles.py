@@ -104,7 +104,10 @@ def _identity(pieces: Parts[Piece]) -> tuple[str, tuple[str, ...]]:
     coordinates = pieces.coordinates()
     names = {coordinate["tile"] for coordinate in coordinates}
     if len(names) != 1:
-        raise StageError(f"expected the pieces of one tile, got those of {len(names)}")
+        raise StageError(
+            f"expected the pieces of one tile, got those of {len(names)}",
+            next_step="run tiling first; a tile is made of the pieces it wrote",
+        )
     return names.pop(), tuple(sorted({c["session"] for c in coordinates if "session" in c}))
 
 
