@@ -223,3 +223,16 @@ def test_kitti_path_length(shared_data: Path) -> None:
     length = np.linalg.norm(np.diff(track.T_odom_lidar[:, :3, 3], axis=0), axis=1).sum()
     assert track.reliable.all()
     assert 9.0 < length < 11.0
+
+
+def test_slip_in_a_tunnel_is_bounded_by_the_accelerometer() -> None:
+    """Half a second in which the wheels turn 40 % too fast would be 2 m; nothing but the IMU can tell."""
+    ride = drive_along(endless_tunnel(), 30, wheel_scale=1.0)
+    since_s = 1e-9 * (ride.wheel.stamp_ns - ride.scans[0].reference_ns)
+    slipping = (since_s > 1.5) & (since_s < 2.0)
+    wheel = dataclasses.replace(ride.wheel, speed_m_s=ride.wheel.speed_m_s * np.where(slipping, 1.4, 1.0))
+    track = dataclasses.replace(ride, wheel=wheel).run()
+    off = track.T_odom_lidar[-1, 0, 3] - 29
+    assert 0.02 < off < 0.6
+    steady = track.covariance[10, 3, 3]
+    assert track.covariance[17, 3, 3] > 4 * steady, "slip is said in the covariance"
