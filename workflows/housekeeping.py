@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from scanloom.pipeline import upkeep
+from scanloom.pipeline import inspection, upkeep
 from scanloom.pipeline.store import Store
 from scanloom.schemas.errors import UsageError
 
@@ -25,7 +25,7 @@ def _open(folder: Path) -> Store:
 
 def explanation(store: Path, artifact: str) -> Json:
     """Why one artifact is what it is. `artifact` is a key, the start of one, or the artifact's folder."""
-    found = upkeep.explain(_open(store), Path(artifact).name if "/" in artifact else artifact)
+    found = inspection.explain(_open(store), Path(artifact).name if "/" in artifact else artifact)
     outputs = [
         {"path": f.path, "bytes": f.size, "sha256": f.sha256}
         for part in found.artifact.parts
@@ -65,7 +65,7 @@ def text_of_explanation(found: Json) -> str:
 
 def store_status(store: Path) -> Json:
     """What the store holds, and how the last runs ended."""
-    found = upkeep.status(_open(store))
+    found = inspection.status(_open(store))
     return {
         "root": str(found.root),
         "bytes": found.bytes,

@@ -59,8 +59,9 @@ def run_fleet(
         order = _order(name, sessions, fleet, folder, store)
         order = dataclasses.replace(order, cluster=cluster, workers=workers)
         rows.append(_row(name, sessions, _make(order, progress), folder))
-    summary = {"maps": rows, "made": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())}
-    write_text(folder / PAGE_FILE, fleet_page(with_changes(rows, last_night), made=summary["made"]))
+    made = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
+    summary: dict[str, Any] = {"maps": rows, "made": made}
+    write_text(folder / PAGE_FILE, fleet_page(with_changes(rows, last_night), made=made))
     write_text(folder / SUMMARY_FILE, json.dumps(summary, indent=1) + "\n")
     failures = [f"{row['map']}: {failure}" for row in rows for failure in row["failures"]]
     return Night(folder / PAGE_FILE, summary, failures, _exit_code(rows))
