@@ -33,7 +33,9 @@ class FullDisk:
         return self.call(*args, **kwargs)
 
 
-@pytest.mark.parametrize(("name", "allowed"), [("fsync", 0), ("fsync", 17), ("fsync", 60), ("rename", 5), ("mkdir", 9)])
+@pytest.mark.parametrize(
+    ("name", "allowed"), [("fsync", 0), ("fsync", 17), ("fsync", 60), ("rename", 5), ("mkdir", 9)]
+)
 def test_full_disk_stops_the_run_and_the_same_command_goes_on(tmp_path, store, monkeypatch, name, allowed):
     with monkeypatch.context() as patch:
         patch.setattr(os, name, FullDisk(getattr(os, name), allowed))

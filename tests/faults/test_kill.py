@@ -31,7 +31,7 @@ def python(module: str, *arguments: object) -> subprocess.Popen[str]:
 def test_killed_at_every_step_of_publishing(tmp_path, seed):
     undisturbed = Store(tmp_path / "undisturbed")
     run(asked(tmp_path), undisturbed, cluster="none")
-    died, _ = python("tests.faults.crashing", tmp_path, seed).communicate(timeout=60)
+    died, _ = python("tests.faults.crashing", tmp_path, seed).communicate(timeout=180)
     assert int(died) >= 8
     survived = Store(tmp_path / "store")
     assert contents(survived) == contents(undisturbed)
@@ -62,7 +62,7 @@ def test_killed_from_outside_at_a_random_moment(tmp_path, cluster, seed):
 
     survived = Store(tmp_path / "store")
     assert survived.verify() == []
-    output, _ = python("tests.faults.running", tmp_path, cluster, 0.03).communicate(timeout=60)
+    output, _ = python("tests.faults.running", tmp_path, cluster, 0.03).communicate(timeout=180)
     assert "executed" in output
     assert contents(survived) == contents(undisturbed)
     assert leftovers(survived) == []
@@ -84,7 +84,7 @@ def test_interrupted_from_the_keyboard(tmp_path):
 
 
 def _wait_for_first_artifact(folder: Path, process: subprocess.Popen[str]) -> None:
-    for _ in range(600):
+    for _ in range(3000):
         if any(folder.glob("read/*/manifest.json")):
             return
         assert process.poll() is None, "the run ended too early"
