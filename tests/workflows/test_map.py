@@ -14,12 +14,11 @@ import pytest
 from tests.logs import scan_folder
 
 
-def scanloom(*words: object, cwd: Path, **env: str) -> subprocess.CompletedProcess[str]:
-    import os
-
+def scanloom(*words: object, cwd: Path, timeout_s: float = 300) -> subprocess.CompletedProcess[str]:
+    """Run the command line as a user would."""
     return subprocess.run(
         [sys.executable, "-m", "scanloom.workflows.cli", *map(str, words)],
-        cwd=cwd, env={**os.environ, **env}, capture_output=True, text=True, timeout=300,
+        cwd=cwd, capture_output=True, text=True, timeout=timeout_s,
     )  # fmt: skip
 
 
