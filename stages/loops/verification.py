@@ -26,6 +26,10 @@ from scanloom.stages.loops.freespace import seen_through
 from scanloom.stages.loops.submaps import Submap
 
 
+TALLER_THAN_A_CAR_M = 2.2
+"""Cars, people and cyclists stay below: what stands higher is there on another day as well."""
+
+
 class VerificationSettings(BaseModel):
     """What a loop must pass."""
 
@@ -68,7 +72,7 @@ class VerificationSettings(BaseModel):
         default=0.04,
         ge=0,
         le=1,
-        description="share of upright structure of one pass that the other looked through",
+        description="share of tall structure of one pass that the other looked through",
     )
     max_disagreement_m: float = Field(
         default=0.25, gt=0, le=5, description="forward against backward registration, m"
@@ -257,17 +261,18 @@ def _indistinct(settings: VerificationSettings, maps: _Maps, upright: F8, T: F8)
 
 
 def _transparent(settings: VerificationSettings, i: Submap, j: Submap, T: F8) -> str:
-    """Upright structure of one pass that the other one's scan looked through."""
-    of_i = transform(inverse(T), _upright(i))
-    conflict = max(seen_through(j.scan, of_i), seen_through(i.scan, transform(T, _upright(j))))
+    """Structure of one pass that the other one's scan looked through; only what is too tall to have driven away."""
+    of_i = transform(inverse(T), _upright(i, TALLER_THAN_A_CAR_M))
+    of_j = transform(T, _upright(j, TALLER_THAN_A_CAR_M))
+    conflict = max(seen_through(j.scan, of_i), seen_through(i.scan, of_j))
     if conflict > settings.max_seen_through:
         return f"{conflict:.0%} of the structure of one pass was seen through on the other"
     return ""
 
 
-def _upright(submap: Submap) -> F8:
+def _upright(submap: Submap, above_ground_m: float = 0.5) -> F8:
     z = submap.ground_z_m if np.isfinite(submap.ground_z_m) else -np.inf
-    return submap.points[~submap.ground & (submap.points[:, 2] > z + 0.5)]
+    return submap.points[~submap.ground & (submap.points[:, 2] > z + above_ground_m)]
 
 
 def _one_sided(settings: VerificationSettings, i: Submap, j: Submap, T: F8) -> str:
