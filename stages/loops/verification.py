@@ -25,7 +25,6 @@ from scanloom.stages.loops.coarse import Hypothesis, hypotheses
 from scanloom.stages.loops.freespace import seen_through
 from scanloom.stages.loops.submaps import Submap
 
-
 TALLER_THAN_A_CAR_M = 2.2
 """Cars, people and cyclists stay below: what stands higher is there on another day as well."""
 
@@ -69,7 +68,7 @@ class VerificationSettings(BaseModel):
         default=0.85, ge=0, le=1, description="fit of the second-best pose over that of the best, at most"
     )
     max_seen_through: float = Field(
-        default=0.04,
+        default=0.035,
         ge=0,
         le=1,
         description="share of tall structure of one pass that the other looked through",
