@@ -47,7 +47,9 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, byt
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_killed_and_started_again(undisturbed: tuple[dict[str, bytes], float], tmp_path: Path, seed: int) -> None:
+def test_killed_and_started_again(
+    undisturbed: tuple[dict[str, bytes], float], tmp_path: Path, seed: int
+) -> None:
     expected, wall_s = undisturbed
     scan_folder(tmp_path / "log", count=20)
     rng = random.Random(seed)
