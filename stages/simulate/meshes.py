@@ -104,7 +104,7 @@ def box(low: ArrayLike, high: ArrayLike, material: Material, taper: float = 1.0)
 
 
 def quad(a: ArrayLike, b: ArrayLike, c: ArrayLike, d: ArrayLike, material: Material) -> Mesh:
-    return _mesh([a, b, c, d], [[0, 1, 2], [0, 2, 3]], material)
+    return _mesh(np.array([a, b, c, d], float), [[0, 1, 2], [0, 2, 3]], material)
 
 
 def cylinder(foot: ArrayLike, top: ArrayLike, radius_m: float, material: Material, sides: int = 8) -> Mesh:
@@ -190,8 +190,8 @@ def house(rng: np.random.Generator, width_m: float, depth_m: float, tall_m: floa
     pitch = rng.uniform(2.2, 3.4)
     for floor in np.arange(0.9, tall_m - 1.6, 2.9):
         for x in np.arange(-w + 0.9, w - 1.6, pitch):
-            sill = [[x - 0.08, -0.12, floor - 0.1], [x + 1.25, 0.0, floor + 1.45]]
-            parts.append(box(*sill, Material.GLASS if rng.random() < 0.6 else Material.PLASTER))
+            pane = Material.GLASS if rng.random() < 0.6 else Material.PLASTER
+            parts.append(box([x - 0.08, -0.12, floor - 0.1], [x + 1.25, 0.0, floor + 1.45], pane))
     if rng.random() < 0.6:
         x, out, z = rng.uniform(-w, w - 2.5), rng.uniform(0.6, 1.5), rng.choice([0.0, 2.8])
         parts.append(box([x, -out, z - 1.0 if z == 0 else z], [x + 2.4, 0, z + rng.uniform(1.0, 2.4)], wall))

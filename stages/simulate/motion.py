@@ -57,7 +57,8 @@ class Motion:
     def velocity(self, t: F8) -> F8:
         """Velocity (n, 3) of the base's origin in the base frame, m/s."""
         R = self.poses(t)[:, :3, :3]
-        return np.einsum("nji,nj->ni", R, self.first(t)[:, :3])
+        out: F8 = np.einsum("nji,nj->ni", R, self.first(t)[:, :3])
+        return out
 
 
 def rotations(roll: F8, pitch: F8, yaw: F8) -> F8:

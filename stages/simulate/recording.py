@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache
@@ -75,9 +76,7 @@ class Recorder:
     def _channel(self, writer: Writer, topic: str) -> int:
         text, _ = _types().generate_msgdef(TYPES[topic], ros_version=2)
         schema = writer.register_schema(TYPES[topic], "ros2msg", text.encode())
-        durability = "transient_local" if topic == TF else "volatile"
-        profile = f"- history: keep_last\n  depth: 10\n  reliability: reliable\n  durability: {durability}\n"
-        return int(writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": profile}))
+        return int(writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": _qos(topic)}))
 
     def metadata(self) -> bytes:
         """`metadata.yaml` of the folder, rosbag2 version 5."""
@@ -92,7 +91,9 @@ class Recorder:
             "  topics_with_message_count:",
         ]
         for topic, count in self.counts.items():
-            meta = f"{{name: {topic}, type: {TYPES[topic]}, serialization_format: cdr, offered_qos_profiles: ''}}"
+            qos = json.dumps(_qos(topic))  # readers take only channels of the file with this very profile
+            kind = f"name: {topic}, type: {TYPES[topic]}, serialization_format: cdr"
+            meta = f"{{{kind}, offered_qos_profiles: {qos}}}"
             lines += [f"    - topic_metadata: {meta}", f"      message_count: {count}"]
         lines += [
             "  compression_format: ''",
@@ -105,6 +106,18 @@ class Recorder:
             f"      message_count: {sum(self.counts.values())}",
         ]
         return ("\n".join(lines) + "\n").encode()
+
+
+def _qos(topic: str) -> str:
+    """Quality of service as rosbag2 before version 9 writes it: numbers of the enums; readers want every key.
+
+    History 1 keeps the last, reliability 1 is reliable, durability 1 is transient local and 2 volatile.
+    """
+    forever = "{sec: 9223372036, nsec: 854775807}"
+    lines = ["history: 1", "depth: 10", "reliability: 1", f"durability: {1 if topic == TF else 2}"]
+    lines += [f"deadline: {forever}", f"lifespan: {forever}", "liveliness: 1"]
+    lines += [f"liveliness_lease_duration: {forever}", "avoid_ros_namespace_conventions: false"]
+    return "- " + "\n  ".join(lines)
 
 
 def entries(
@@ -127,10 +140,8 @@ def _cloud_message(sweep: Sweep) -> Any:
     points["intensity"], points["ring"], points["time"] = sweep.intensity, sweep.ring, sweep.time_s
     point_field = _class("sensor_msgs/msg/PointField")
     kinds = {"<f4": 7, "<u2": 4}
-    fields = [
-        point_field(name, POINT.fields[name][1], kinds[POINT.fields[name][0].str], 1)
-        for name in POINT.names or ()
-    ]
+    layout = dict(POINT.fields or {})
+    fields = [point_field(name, layout[name][1], kinds[layout[name][0].str], 1) for name in POINT.names or ()]
     return _class(TYPES[LIDAR])(
         header=_header(sweep.start_ns, "lidar"),
         height=1,

@@ -51,7 +51,8 @@ class Path:
     def curvature(self, s: F8) -> F8:
         d1, d2 = self.at(s, 1), self.at(s, 2)
         speed = np.hypot(d1[:, 0], d1[:, 1])
-        return (d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]) / speed**3
+        out: F8 = (d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]) / speed**3
+        return out
 
     def heading(self, s: F8) -> F8:
         d = self.at(s, 1)
@@ -166,7 +167,7 @@ def progress(settings: Settings, path: Path) -> tuple[F8, F8]:
         speed[k] = v
         s += v * TICK_S
     speed = gaussian_filter1d(speed, 0.35 / TICK_S, mode="nearest")
-    t = -MARGIN_S + TICK_S * np.arange(ticks)
+    t: F8 = -MARGIN_S + TICK_S * np.arange(ticks, dtype=float)
     return t, settings.start_m + np.concatenate(([0.0], np.cumsum((speed[1:] + speed[:-1]) / 2))) * TICK_S
 
 

@@ -224,10 +224,9 @@ def scene_of(mesh: Mesh) -> Any:
     """A scene that rays can be cast into."""
     import open3d as o3d
 
+    tensor: Any = o3d.core.Tensor  # its stubs know nothing of numpy
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.triangles.astype(np.uint32))
-    )
+    scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
     return scene
 
 
@@ -235,7 +234,8 @@ def cast(scene: Any, rays: NDArray[np.float32]) -> dict[str, NDArray[Any]]:
     """Range (n,) m (inf where nothing is met), triangle (n,), cosine of incidence (n,) of rays (n, 6)."""
     import open3d as o3d
 
-    hit = scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays)))
+    tensor: Any = o3d.core.Tensor
+    hit = scene.cast_rays(tensor(np.ascontiguousarray(rays)))
     normal = hit["primitive_normals"].numpy()
     return {
         "range": hit["t_hit"].numpy(),

@@ -42,12 +42,13 @@ class Road:
         dx, dy = self.b[0] - self.a[0], self.b[1] - self.a[1]
         along = ((x - self.a[0]) * dx + (y - self.a[1]) * dy) / (dx * dx + dy * dy)
         along = np.clip(along, 0, 1)
-        return np.hypot(x - self.a[0] - along * dx, y - self.a[1] - along * dy)
+        off: F8 = np.hypot(x - self.a[0] - along * dx, y - self.a[1] - along * dy)
+        return off
 
     def _arc_distance(self, x: F8, y: F8, centre: tuple[float, float]) -> F8:
         u, v = x - centre[0], y - centre[1]
         radius = np.hypot(self.a[0] - centre[0], self.a[1] - centre[1])
-        off = np.abs(np.hypot(u, v) - radius)
+        off: F8 = np.abs(np.hypot(u, v) - radius)
         if self.a == self.b:
             return off
         start = np.arctan2(self.a[1] - centre[1], self.a[0] - centre[0])
@@ -74,8 +75,9 @@ ROADS = (
 
 def smoothstep(u: ArrayLike) -> F8:
     """0 to 1 over u in 0..1 with two continuous derivatives."""
-    u = np.clip(np.asarray(u, float), 0, 1)
-    return u**3 * (10 - 15 * u + 6 * u**2)
+    v = np.clip(np.asarray(u, float), 0, 1)
+    out: F8 = v**3 * (10 - 15 * v + 6 * v**2)
+    return out
 
 
 def road_distance(x: F8, y: F8) -> tuple[F8, NDArray[np.bool_]]:
@@ -146,8 +148,8 @@ class Terrain:
         return out
 
     def mesh(self) -> Mesh:
-        x = WEST + CELL_M * np.arange(self.z.shape[1])
-        y = SOUTH + CELL_M * np.arange(self.z.shape[0])
+        x: F8 = WEST + CELL_M * np.arange(self.z.shape[1], dtype=float)
+        y: F8 = SOUTH + CELL_M * np.arange(self.z.shape[0], dtype=float)
         return grid_mesh(x, y, self.z.astype(float), Material.GRASS)
 
 

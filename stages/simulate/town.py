@@ -129,14 +129,14 @@ def _houses(town: Town, rng: np.random.Generator) -> list[F8]:
                 mesh = meshes.house(rng, width, depth, rng.uniform(*street.tall_m))
                 if _buildable(plot, plots):
                     yaw = np.arctan2(across[1], across[0]) - np.pi / 2
-                    town.put(mesh, *front, float(yaw), instance=True)
+                    town.put(mesh, float(front[0]), float(front[1]), float(yaw), instance=True)
                     plots.append(plot)
                 u += width + rng.uniform(*street.gap_m)
     return plots
 
 
 def _buildable(plot: F8, plots: list[F8]) -> bool:
-    x, y = np.meshgrid(np.linspace(*plot[:, 0], 5), np.linspace(*plot[:, 1], 5))
+    x, y = np.meshgrid(*(np.linspace(low, high, 5) for low, high in plot.T))
     if road_distance(x, y)[0].min() < 8.3 or ((embankment(x) > 0.02) & (y > 5) & (y < 160)).any():
         return False
     if (plot[1, 0] > TUNNEL[0] - 4 and plot[0, 1] < 40) or np.hypot(x - ROUNDABOUT[0], y).min() < 18:

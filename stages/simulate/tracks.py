@@ -78,9 +78,9 @@ def imu_track(settings: Settings, motion: Motion) -> ImuTrack:
     step = 1 / np.sqrt(IMU_HZ)
 
     def wander(start: float, growth: float) -> F8:
-        return start * rng.standard_normal(3) + np.cumsum(
-            growth * step * rng.standard_normal((len(t), 3)), axis=0
-        )
+        first = start * rng.standard_normal(3)
+        out: F8 = first + np.cumsum(growth * step * rng.standard_normal((len(t), 3)), axis=0)
+        return out
 
     gyro = rate @ R_base_imu + wander(settings.gyro_bias_rad_s, settings.gyro_walk_rad_s)
     accel = force @ R_base_imu + wander(settings.accel_bias_m_s2, settings.accel_walk_m_s2)
