@@ -166,9 +166,11 @@ def _imu(track: ImuTrack) -> Iterator[Entry]:
 
 
 def _wheel(track: WheelTrack) -> Iterator[Entry]:
-    covariance = np.diag([4e-4, 1e-2, 1.0, 1.0, 1.0, 1.0]).ravel()
-    for stamp, speed in zip(track.stamp_ns.tolist(), track.speed_m_s.tolist()):
-        twist = _class("geometry_msgs/msg/Twist")(_vector([speed, 0.0, 0.0]), _vector([0.0, 0.0, 0.0]))
+    covariance = np.diag([4e-4, 1e-2, 1.0, 1.0, 1.0, 4e-4]).ravel()
+    for stamp, speed, turn in zip(
+        track.stamp_ns.tolist(), track.speed_m_s.tolist(), track.yaw_rate_rad_s.tolist()
+    ):
+        twist = _class("geometry_msgs/msg/Twist")(_vector([speed, 0.0, 0.0]), _vector([0.0, 0.0, turn]))
         with_covariance = _class("geometry_msgs/msg/TwistWithCovariance")(twist, covariance)
         message = _class(TYPES[WHEEL])(_header(stamp, "base_link"), with_covariance)
         yield stamp + DELAY_NS[WHEEL], WHEEL, stamp, _serialise(WHEEL, message)

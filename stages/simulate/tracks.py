@@ -38,6 +38,8 @@ class WheelTrack:
     t: F8
     stamp_ns: NDArray[np.int64]
     speed_m_s: F8
+    yaw_rate_rad_s: F8
+    """From the difference of the rear wheels."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,9 @@ def wheel_track(settings: Settings, motion: Motion) -> WheelTrack:
     speed = true * (
         1 + settings.wheel_scale + slip
     ) + moving * settings.wheel_noise_m_s * rng.standard_normal(len(t))
-    return WheelTrack(t, _stamps(settings, t, rng, settings.wheel_clock_s), np.round(speed, 3) * moving)
+    turn = motion.body_rates(t)[0][:, 2] * (1 + 2 * settings.wheel_scale) + 0.02 * rng.standard_normal(len(t))
+    stamps = _stamps(settings, t, rng, settings.wheel_clock_s)
+    return WheelTrack(t, stamps, np.round(speed, 3) * moving, np.round(turn, 4) * moving)
 
 
 def gnss_track(settings: Settings, motion: Motion, scene: Any) -> GnssTrack:

@@ -17,6 +17,7 @@ from scanloom.stages.simulate.terrain import FIELD_X, LANE_M
 ONCOMING_M = 2 * LANE_M
 """Offset of the other lane to the left, m."""
 PAVEMENT_M = -5.0
+CLEARANCE_M = 2.1
 LEAD_S = 4.0
 """The truck drives this far ahead, s."""
 DUST_AGES_S = np.arange(0.35, 3.0, 0.4)
@@ -79,14 +80,22 @@ def build_traffic(settings: Settings, path: Path, motion: Motion) -> list[Actor]
         start = path.length_m * (k + rng.uniform(0.1, 0.9)) / 9
         paint = Material.PAINT_LIGHT if k % 2 else Material.PAINT_DARK
         actors.append(Actor(f"oncoming {k}", car(paint), cruise(start, -rng.uniform(5, 8)), ONCOMING_M, True))
-    actors.append(Actor("cyclist", cyclist(), cruise(35.0, 4.2), -1.1))
+    actors.append(Actor("cyclist", cyclist(), cruise(35.0, 4.2), -2.2))
     for k in range(8):
         start = rng.uniform(0.0, 420.0)
         walk = stroll(start, rng.uniform(0.9, 1.5), rng.uniform(0, 6.28))
         actors.append(
             Actor(f"person {k}", person(rng.uniform(0.15, 0.3)), walk, PAVEMENT_M - rng.uniform(0, 1.5))
         )
-    return actors
+    return [actor for actor in actors if _keeps_clear(actor, settings, path, motion)]
+
+
+def _keeps_clear(actor: Actor, settings: Settings, path: Path, motion: Motion) -> bool:
+    """Whether it never drives through the own vehicle; where lanes merge, constant speeds would."""
+    t = np.arange(0.0, settings.duration_s, 0.2)
+    own, other = motion.poses(t)[:, :3, 3], actor.poses(path, t)[:, :3, 3]
+    apart = own + motion.poses(t)[:, :3, 0] - other
+    return bool((np.linalg.norm(apart, axis=1) > CLEARANCE_M).all())
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,87 @@
+"""One drive: the town, the motion, the sensors, and the log they make."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from typing import IO
+
+import numpy as np
+
+from scanloom.schemas.scans import TrueLabels, TruePoints
+from scanloom.schemas.trajectory import Truth
+from scanloom.stages.simulate.motion import Motion, build_motion
+from scanloom.stages.simulate.recording import Recorder, entries
+from scanloom.stages.simulate.rig import T_BASE
+from scanloom.stages.simulate.route import build_path, ring
+from scanloom.stages.simulate.settings import Settings
+from scanloom.stages.simulate.sweeping import Lidar, Sweep, scene_of
+from scanloom.stages.simulate.town import build_town
+from scanloom.stages.simulate.tracks import gnss_track, imu_track, wheel_track
+from scanloom.stages.simulate.traffic import build_traffic
+
+SETTLED = "simulated: exact"
+
+
+class Drive:
+    """One drive; keeps of every sweep only what its points truly are, compressed."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self._recorder = Recorder()
+        self._labels: list[tuple[bytes, bytes]] = []
+        self._motion: Motion | None = None
+
+    def write_log(self, stream: IO[bytes]) -> None:
+        s = self.settings
+        town = build_town(s.town_seed, s.parking_seed)
+        path = build_path(ring(), town.terrain) if s.route == "roundabout" else town.path
+        town.path = path
+        motion = build_motion(s, path)
+        lidar = Lidar(s, town, motion, build_traffic(s, path, motion))
+        gnss_settings = s if s.gnss else s.model_copy(update={"duration_s": 0.0})
+        gnss = gnss_track(gnss_settings, motion, scene_of(town.triangles()[0]))
+        sweeps = self._noting_truth(lidar.sweeps())
+        start_ns = s.start_s * 1_000_000_000
+        self._recorder.record(
+            stream, entries(start_ns, sweeps, imu_track(s, motion), wheel_track(s, motion), gnss)
+        )
+        self._motion = motion
+
+    def write_metadata(self, stream: IO[bytes]) -> None:
+        stream.write(self._recorder.metadata())
+
+    def write_trajectory(self, stream: IO[bytes]) -> None:
+        motion = self._driven()
+        t = np.arange(int(self.settings.duration_s * 100) + 1) / 100
+        stamps = self.settings.start_s * 1_000_000_000 + np.round(t * 1e9).astype(np.int64)
+        Truth(stamps, motion.poses(t) @ T_BASE["lidar"], SETTLED).write_to(stream)
+
+    def write_points(self, stream: IO[bytes]) -> None:
+        self._driven()
+        TruePoints(self._true_labels()).write_to(stream)
+
+    def _driven(self) -> Motion:
+        """The motion, after the log was written."""
+        if self._motion is None:
+            import io
+
+            self.write_log(io.BytesIO())
+        assert self._motion is not None  # noqa: S101  (write_log sets it)
+        return self._motion
+
+    def _noting_truth(self, sweeps: Iterator[Sweep]) -> Iterator[Sweep]:
+        self._labels = []
+        for sweep in sweeps:
+            self._labels.append(
+                (zlib.compress(sweep.kind.tobytes(), 1), zlib.compress(sweep.instance.tobytes(), 1))
+            )
+            yield sweep
+
+    def _true_labels(self) -> Iterator[TrueLabels]:
+        for index, (kind, instance) in enumerate(self._labels):
+            yield TrueLabels(
+                np.frombuffer(zlib.decompress(kind), np.uint8),
+                np.frombuffer(zlib.decompress(instance), np.uint16),
+                scan_index=index,
+            )
