@@ -11,20 +11,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
+from scanloom.pipeline.forkserver import THREADS, start_forkserver
 from scanloom.pipeline.task import Json, execute
 from scanloom.schemas.errors import ScanloomError, UsageError
 
 log = logging.getLogger(__name__)
-
-THREADS = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "NUMBA_NUM_THREADS": "1",
-    "ARROW_NUM_THREADS": "1",
-    "MALLOC_TRIM_THRESHOLD_": "65536",
-}
-"""Environment of local workers: one native thread each, and freed memory goes back to the system."""
 
 WORKERS_WITHIN_S = 60.0
 """How long to wait for the first worker of a cluster."""
@@ -193,7 +184,7 @@ def worker_death(error: BaseException) -> str:
 
 def _local(workers: int | None, modules: Sequence[str]) -> tuple[Any, Any]:
     """Processes of this machine, one per core."""
-    _start_forkserver(modules)
+    start_forkserver(modules)
     import dask
     from distributed import Client, LocalCluster
 
@@ -220,23 +211,6 @@ def _local(workers: int | None, modules: Sequence[str]) -> tuple[Any, Any]:
         host="127.0.0.1",
     )
     return Client(cluster, set_as_default=False), cluster
-
-
-def _start_forkserver(modules: Sequence[str]) -> None:
-    """Start the process that workers fork from. It imports what they need while this process imports Dask."""
-    from multiprocessing import forkserver, get_context
-
-    for name, value in THREADS.items():
-        os.environ.setdefault(name, value)
-    ours = [
-        "scanloom.pipeline.local_worker",
-        "distributed",
-        "scanloom.pipeline.task",
-        "pyarrow.parquet",
-        "numpy.random",
-    ]
-    get_context("forkserver").set_forkserver_preload([*ours, *modules])
-    forkserver.ensure_running()
 
 
 def _remote(address: str) -> tuple[Any, Any]:
@@ -270,6 +244,8 @@ def _made(path: str, workers: int | None) -> tuple[Any, Any]:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Dask's own log is about its plumbing; errors reach the user by other ways."""
+    import distributed  # noqa: F401  (importing it sets log levels, which are then changed)
+
     for name in (
         "distributed",
         "distributed.nanny",

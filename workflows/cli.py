@@ -10,7 +10,6 @@ import time
 from pathlib import Path
 from typing import Annotated, Any
 
-import psutil
 import typer
 
 from scanloom.schemas.errors import EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_OK, ScanloomError
@@ -83,8 +82,23 @@ def _emit(body: Any) -> None:
     print(json.dumps(body, indent=1, default=str))
 
 
+def _process_start_s() -> float:
+    """When this command was started, seconds since 1970."""
+    import psutil
+
+    return float(psutil.Process().create_time())
+
+
 def _store_folder(given: Path | None) -> Path:
     return given or Path(os.environ.get("SCANLOOM_STORE", "store"))
+
+
+def _start_workers(cluster: str, *, idle: bool = False) -> None:
+    """Workers import on another core what this process imports next."""
+    if cluster == "local" and not idle:
+        from scanloom.pipeline.forkserver import start_forkserver
+
+        start_forkserver(["scanloom.workflows.map_session"])
 
 
 @app.command("map")
@@ -104,6 +118,7 @@ def map_command(
     as_json: JsonOption = False,
 ) -> None:
     """Logs into a map: trajectory, tiles, metrics and a report."""
+    _start_workers(cluster, idle=dry_run)
     from scanloom.pipeline.progress import progress_for
     from scanloom.workflows.build_map import Order, build_map, plan_map
     from scanloom.workflows.configuration import command_line_settings, project_settings
@@ -119,7 +134,7 @@ def map_command(
         workers=workers,
         project=project_settings(project),
         command_line=command_line_settings(settings or []),
-        started_s=psutil.Process().create_time(),
+        started_s=_process_start_s(),
     )
     if dry_run:
         _show_plan(*plan_map(order), as_json)
@@ -231,6 +246,7 @@ def nightly(
     as_json: JsonOption = False,
 ) -> None:
     """Many logs, many maps, one summary; a bad log never stops the night."""
+    _start_workers(cluster)
     from scanloom.pipeline.progress import progress_for
     from scanloom.workflows.nightly import run_fleet
 
