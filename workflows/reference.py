@@ -85,7 +85,7 @@ def _stage_page(n: Node) -> str:
 def _settings_table(n: Node) -> str:
     rows = []
     for name, field in n.settings.model_fields.items():
-        bounds = ", ".join(str(m) for m in field.metadata)
+        bounds = ", ".join(filter(None, (_bound(m) for m in field.metadata)))
         rows.append(
             (
                 f"`{n.name}.{name}`",
@@ -95,6 +95,13 @@ def _settings_table(n: Node) -> str:
             )
         )
     return _table(("setting", "default", "bounds", "meaning"), rows) if rows else "\nNone.\n"
+
+
+def _bound(constraint: object) -> str:
+    for name, sign in (("ge", "≥"), ("gt", ">"), ("le", "≤"), ("lt", "<")):
+        if hasattr(constraint, name):
+            return f"{sign} {getattr(constraint, name):g}"
+    return ""
 
 
 def _shown(value: object) -> object:

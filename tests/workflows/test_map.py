@@ -94,9 +94,9 @@ def test_tile_size_reruns_tiling_and_what_follows(mapped: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda p: None, "does not exist"),
+        (lambda p: None, "no such file"),
         (lambda p: p.write_bytes(b""), "empty"),
-        (lambda p: p.write_text("this is a shopping list, not a log\n" * 50), "not a"),
+        (lambda p: p.write_text("this is a shopping list, not a log\n" * 50), "plain text"),
     ],
     ids=["missing", "empty", "text"],
 )
