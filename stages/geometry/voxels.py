@@ -74,7 +74,8 @@ def find_slot(keys: NDArray[np.int64], key: Int) -> Int:
 
 
 @kernel
-def _key_of(x: Float, y: Float, z: Float, per_m: Float) -> int:
+def key_of(x: Float, y: Float, z: Float, per_m: Float) -> int:
+    """Key of the voxel that holds a point; EMPTY when it is not finite."""
     if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
         return EMPTY
     return pack(np.int64(np.floor(x * per_m)), np.int64(np.floor(y * per_m)), np.int64(np.floor(z * per_m)))
@@ -84,7 +85,7 @@ def _key_of(x: Float, y: Float, z: Float, per_m: Float) -> int:
 def _keys(points: NDArray[np.floating], per_m: Float) -> NDArray[np.int64]:
     out = np.empty(len(points), np.int64)
     for n in range(len(points)):
-        out[n] = _key_of(float(points[n, 0]), float(points[n, 1]), float(points[n, 2]), per_m)
+        out[n] = key_of(float(points[n, 0]), float(points[n, 1]), float(points[n, 2]), per_m)
     return out
 
 
@@ -94,7 +95,7 @@ def _first_per_voxel(points: NDArray[np.floating], per_m: Float, length: Int) ->
     out = np.empty(len(points), np.int64)
     found = 0
     for n in range(len(points)):
-        key = _key_of(float(points[n, 0]), float(points[n, 1]), float(points[n, 2]), per_m)
+        key = key_of(float(points[n, 0]), float(points[n, 1]), float(points[n, 2]), per_m)
         if key == EMPTY:
             continue
         slot = find_slot(keys, key)

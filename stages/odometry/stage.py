@@ -5,23 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scanloom.schemas.errors import StageError
 from scanloom.schemas.product import Parts
-from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
+from scanloom.schemas.scans import Deskewed, Labels
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.schemas.trajectory import Odometry
+from scanloom.stages.geometry.lookahead import ahead
 from scanloom.stages.odometry.prediction import Predictor
 from scanloom.stages.odometry.settings import Settings
+from scanloom.stages.odometry.thinning import ThinScan, thin
 from scanloom.stages.odometry.tracker import Row, Tracker
 
 __all__ = ["VERSION", "Settings", "odometry"]
 
 VERSION = 1
-USED = (PointClass.UNLABELLED, PointClass.GROUND, PointClass.STATIC)
-USED_CLASS = np.isin(np.arange(256), USED)
 
 
 def odometry(
@@ -45,14 +44,14 @@ def odometry(
     predictor = Predictor(session, imu, wheel)
     tracker = Tracker(settings, predictor, np.array(session.T_base("lidar")))
     rows: list[Row] = []
-    for scan, label in _pairs(deskewed, labels, session.name):
-        if rows and scan.reference_ns <= rows[-1].stamp_ns:
+    for scan in ahead(_thinned(settings, deskewed, labels, session.name)):
+        if rows and scan.stamp_ns <= rows[-1].stamp_ns:
             raise StageError(
                 f"scan {scan.scan_index} is not later than the scan before it",
-                where=f"session {session.name}, stamp {scan.reference_ns} ns",
+                where=f"session {session.name}, stamp {scan.stamp_ns} ns",
                 next_step="look at the clock of the LiDAR with `scanloom inspect`",
             )
-        rows.append(tracker.step(scan.scan_index, scan.reference_ns, used_points(scan, label)))
+        rows.append(tracker.step(scan))
     if len(rows) < 2:
         raise StageError(
             f"odometry needs at least two scans, and there are {len(rows)}",
@@ -62,14 +61,9 @@ def odometry(
     return _table(rows)
 
 
-def used_points(scan: DeskewedScan, labels: ScanLabels) -> NDArray[np.float32]:
-    """Points (n, 3) that may be part of the static world, in the LiDAR frame, m."""
-    return scan.points()[USED_CLASS[labels.class_]]
-
-
-def _pairs(
-    deskewed: Parts[Deskewed], labels: Parts[Labels], session: str
-) -> Iterator[tuple[DeskewedScan, ScanLabels]]:
+def _thinned(
+    settings: Settings, deskewed: Parts[Deskewed], labels: Parts[Labels], session: str
+) -> Iterator[ThinScan]:
     for scans, scan_labels in zip(deskewed, labels, strict=True):
         for scan, label in zip(scans, scan_labels, strict=True):
             if len(scan) != len(label) or scan.scan_index != label.scan_index:
@@ -78,7 +72,7 @@ def _pairs(
                     where=f"session {session}",
                     next_step="run `scanloom verify`, then map again",
                 )
-            yield scan, label
+            yield thin(settings, scan, label)
 
 
 def _table(rows: list[Row]) -> Odometry:

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scanloom.stages.geometry.degeneracy import Degeneracy, blind, judge, scan_covariance
 from scanloom.stages.geometry.registration import Registration, VoxelMap, align
 from scanloom.stages.geometry.se3 import F8, inverse, se3_log, transform
-from scanloom.stages.geometry.voxels import downsample
 from scanloom.stages.odometry.prediction import Prediction, Predictor, forward_guesses
 from scanloom.stages.odometry.settings import Settings
+from scanloom.stages.odometry.thinning import ThinScan
 
 MIN_POINTS = 50
 MIN_INLIERS = 30
@@ -53,20 +52,18 @@ class Tracker:
         self.keyframe_T, self.keyframe_ns = np.eye(4), 0
         self.inserted_T = np.eye(4)
 
-    def step(self, index: int, stamp_ns: int, points: NDArray[np.floating]) -> Row:
-        """Take the next scan: points (n, 3) in the LiDAR frame at `stamp_ns`."""
-        thinned = points[downsample(points, self.settings.map_spacing_m)]
-        fine = thinned.astype(np.float64)
-        coarse = fine[downsample(thinned, self.settings.source_voxel_m)]
+    def step(self, scan: ThinScan) -> Row:
+        """Take the next scan."""
+        index, stamp_ns = scan.scan_index, scan.stamp_ns
         first = self.scans == 0
         self.scans += 1
         if first:
-            return self._begin(index, stamp_ns, fine)
+            return self._begin(index, stamp_ns, scan.fine)
         prediction = self.predictor.predict(self.last_ns, stamp_ns)
-        found = self._register(coarse, prediction)
+        found = self._register(scan.coarse, prediction)
         motion = found.T_last_now if found.reliable else prediction.T_last_now
         self._move(stamp_ns, motion, prediction, found)
-        self._extend_map(fine, found.reliable)
+        self._extend_map(scan.fine, found.reliable)
         keyframe = self._is_keyframe(stamp_ns)
         return Row(
             index,

@@ -1,0 +1,61 @@
+"""What odometry keeps of a scan: static points, thinned twice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.schemas.scans import DeskewedScan, PointClass, ScanLabels
+from scanloom.stages.geometry.kernels import kernel
+from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.voxels import EMPTY, Float, Int, downsample, find_slot, key_of, table_length
+from scanloom.stages.odometry.settings import Settings
+
+USED = (PointClass.UNLABELLED, PointClass.GROUND, PointClass.STATIC)
+USED_CLASS = np.isin(np.arange(256), USED)
+
+
+@dataclass(frozen=True)
+class ThinScan:
+    """Points in the LiDAR frame, m: `fine` (n, 3) for the map, `coarse` (m, 3) of these for registration."""
+
+    scan_index: int
+    stamp_ns: int
+    fine: F8
+    coarse: F8
+
+
+def thin(settings: Settings, scan: DeskewedScan, labels: ScanLabels) -> ThinScan:
+    """Of the points that may be part of the static world, the first in each voxel."""
+    fine = _first_used(
+        scan.x_m, scan.y_m, scan.z_m, labels.class_, USED_CLASS, 1.0 / settings.map_spacing_m,
+        table_length(len(scan)),
+    )  # fmt: skip
+    coarse = fine[downsample(fine, settings.source_voxel_m)]
+    return ThinScan(scan.scan_index, scan.reference_ns, fine, coarse)
+
+
+@kernel
+def _first_used(
+    xs: NDArray[np.float32], ys: NDArray[np.float32], zs: NDArray[np.float32], classes: NDArray[np.uint8],
+    used: NDArray[np.bool_], per_m: Float, length: Int,
+) -> F8:  # fmt: skip
+    """First point of every voxel among those of a used class, in order; what is not finite is left out."""
+    keys = np.full(length, EMPTY, np.int64)
+    out = np.empty((len(xs), 3))
+    found = 0
+    for n in range(len(xs)):
+        if not used[classes[n]]:
+            continue
+        x, y, z = float(xs[n]), float(ys[n]), float(zs[n])
+        key = key_of(x, y, z, per_m)
+        if key == EMPTY:
+            continue
+        slot = find_slot(keys, key)
+        if keys[slot] == EMPTY:
+            keys[slot] = key
+            out[found, 0], out[found, 1], out[found, 2] = x, y, z
+            found += 1
+    return out[:found].copy()
