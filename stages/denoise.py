@@ -107,11 +107,15 @@ def _bounded(x: F4, y: F4, z: F4, T: F8, low: F8, high: F8, nearest: float, fart
     """OUT_OF_RANGE, EGO, or STATIC for the rest."""
     out = np.empty(len(x), np.uint8)
     top = min(high[2], T[2, 3])
+    reach2 = _reach2(T, low, high)
     for i in range(len(x)):
         px, py, pz = float(x[i]), float(y[i]), float(z[i])
         square = px * px + py * py + pz * pz
         if not (0.0 < square <= farthest * farthest):  # also catches NaN
             out[i] = OUT_OF_RANGE
+            continue
+        if square > reach2 and square >= nearest * nearest:
+            out[i] = STATIC
             continue
         u = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
         v = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
@@ -123,3 +127,12 @@ def _bounded(x: F4, y: F4, z: F4, T: F8, low: F8, high: F8, nearest: float, fart
         else:
             out[i] = STATIC
     return out
+
+
+@kernel
+def _reach2(T: F8, low: F8, high: F8) -> float:
+    """Square of a distance from the LiDAR, m2, that the own vehicle does not reach."""
+    square = 0.0
+    for k in range(3):
+        square += max(abs(low[k] - T[k, 3]), abs(high[k] - T[k, 3])) ** 2
+    return 1.001 * square

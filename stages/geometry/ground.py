@@ -7,6 +7,8 @@ closely than a flat one. The walk starts from a plane fitted around the sensor, 
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,10 +76,12 @@ def seed_plane(lowest: F8) -> F8 | None:
     return plane
 
 
+@cache
 def _bin_centers() -> F8:
     return np.array([_center(b) for b in range(BINS)])
 
 
+@cache
 def _sector_directions() -> tuple[F8, F8]:
     direction = np.array([_direction(s) for s in range(SECTORS)])
     return direction[:, 0], direction[:, 1]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.stages.geometry.kernels import kernel
-from scanloom.stages.geometry.voxels import EMPTY, find_slot, table_length
+from scanloom.stages.geometry.voxels import EMPTY, Int, find_slot, table_length
 
 F4 = NDArray[np.float32]
 B1 = NDArray[np.bool_]
@@ -19,6 +19,8 @@ I8 = NDArray[np.int64]
 
 EDGE_SHARE = 0.7
 """Edge of a voxel over the radius; a point sees its own voxel and the 26 around, so between 0.7 and 1.4 radii."""
+ALONGSIDE = 3
+"""Points before and after a point, in their order, that are looked at before the voxels around it."""
 INDEX_BITS = 19
 INDEX_OFFSET = 1 << (INDEX_BITS - 1)
 
@@ -65,6 +67,8 @@ def _fill(
 ) -> tuple[NDArray[np.int8], I4]:
     """Counts the points of each voxel; returns the level (n,), -1 for points left out, and the slot (n,) of each."""
     level, slot = np.full(len(x), -1, np.int8), np.zeros(len(x), np.int32)
+    found: Int = 0
+    last_key = EMPTY
     for n in range(len(x)):
         if not usable[n]:
             continue
@@ -74,8 +78,10 @@ def _fill(
         key = _key(
             at, int(np.floor(px * per_edge)), int(np.floor(py * per_edge)), int(np.floor(pz * per_edge))
         )
-        found = find_slot(keys, key)
-        keys[found] = key
+        if key != last_key:
+            found = find_slot(keys, key)
+            keys[found] = key
+            last_key = key
         counts[found] += 1
         level[n], slot[n] = at, found
     return level, slot
@@ -88,6 +94,8 @@ def _lonely(
     out = np.zeros(len(x), np.bool_)
     for n in range(len(x)):
         if level[n] < 0 or counts[slot[n]] > least:
+            continue
+        if _alongside(x, y, z, level, n, edge, least):
             continue
         px, py, pz = float(x[n]), float(y[n]), float(z[n])
         ratio = per_m * np.sqrt(px * px + py * py + pz * pz)
@@ -103,6 +111,26 @@ def _lonely(
 
 
 @kernel
+def _alongside(x: F4, y: F4, z: F4, level: NDArray[np.int8], n: int, edge: float, enough: int) -> bool:
+    """Whether the points next in order alone suffice: what `_around` would find, without a look into the table."""
+    per_edge = 1.0 / (edge * (1 << level[n]))
+    i, j, k = int(np.floor(x[n] * per_edge)), int(np.floor(y[n] * per_edge)), int(np.floor(z[n] * per_edge))
+    seen = 1
+    for m in range(max(n - ALONGSIDE, 0), min(n + ALONGSIDE + 1, len(x))):
+        if m == n or level[m] != level[n]:
+            continue
+        if (
+            abs(int(np.floor(x[m] * per_edge)) - i) <= 1
+            and abs(int(np.floor(y[m] * per_edge)) - j) <= 1
+            and abs(int(np.floor(z[m] * per_edge)) - k) <= 1
+        ):
+            seen += 1
+            if seen > enough:
+                return True
+    return False
+
+
+@kernel
 def _around(
     px: float, py: float, pz: float, level: int, edge: float, keys: I8, counts: I4, enough: int
 ) -> int:
@@ -110,12 +138,11 @@ def _around(
     per_edge = 1.0 / (edge * (1 << level))
     i, j, k = int(np.floor(px * per_edge)), int(np.floor(py * per_edge)), int(np.floor(pz * per_edge))
     seen = 0
-    for di in range(-1, 2):
-        for dj in range(-1, 2):
-            for dk in range(-1, 2):
-                found = find_slot(keys, _key(level, i + di, j + dj, k + dk))
-                if keys[found] != EMPTY:
-                    seen += int(counts[found])
-                    if seen > enough:
-                        return seen
+    for a in range(27):  # 0, 1, -1 on each axis: the voxels nearby come first
+        di, dj, dk = (a // 3 % 3 + 1) % 3 - 1, (a % 3 + 1) % 3 - 1, (a // 9 + 1) % 3 - 1
+        found = find_slot(keys, _key(level, i + di, j + dj, k + dk))
+        if keys[found] != EMPTY:
+            seen += int(counts[found])
+            if seen > enough:
+                return seen
     return seen
