@@ -19,7 +19,7 @@ VARIES = {"metrics.json", "report.html"}
 
 
 def _start(folder: Path, workers: int) -> subprocess.Popen[bytes]:
-    words = ["map", "log", "--out", "out", "--workers", str(workers), "--set", "ingest.chunk_s=0.5"]
+    words = ["map", "log", "--out", "out", "--workers", str(workers), "--set", "ingest.chunk_s=1"]
     return subprocess.Popen(
         [sys.executable, "-m", "scanloom.workflows.cli", *words],
         cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True,
