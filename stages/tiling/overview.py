@@ -47,10 +47,9 @@ def overview(settings: Settings, tiles: Parts[Tile]) -> tuple[TileIndex, MapFile
 
     def write_map(stream: IO[bytes]) -> None:
         comments = ply.georeference_comments(index.frame, index.georeference, (0.0, 0.0, 0.0))
-        points = sum(len(survey.picks) for survey in surveys)
+        points = sum(len(survey.coarse) for survey in surveys) // ply.VERTEX.itemsize
         stream.write(ply.header(points, ["scanloom map", *comments]))
-        for tile, survey in zip(tiles, surveys):
-            stream.write(_vertices(tile, survey.picks))
+        stream.writelines(survey.coarse for survey in surveys)
 
     return index, MapFiles(contents={"map.ply": write_map})
 
@@ -65,13 +64,14 @@ class Survey:
     high_m: NDArray[np.float64]
     sessions: tuple[str, ...]
     checksum: str
-    picks: NDArray[np.int64]
+    coarse: bytes
+    """Its vertices of `map.ply`."""
 
 
 def _survey(name: str, tile: Tile, map_voxel_size_m: float) -> Survey:
     low, high = _bounds(tile)
-    picks = coarse_picks(tile, map_voxel_size_m)
-    return Survey(name, len(tile), low, high, tuple(tile.sessions), checksum(tile), picks)
+    coarse = _vertices(tile, coarse_picks(tile, map_voxel_size_m))
+    return Survey(name, len(tile), low, high, tuple(tile.sessions), checksum(tile), coarse)
 
 
 def tile_index(surveys: list[Survey], example: Tile) -> TileIndex:

@@ -75,6 +75,8 @@ def merge(pieces: list[Piece]) -> Piece:
     keys = _keys(everything.voxel)
     order = np.argsort(keys, kind="stable")  # timsort: the pieces come sorted, so this is a merge
     starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    if len(pieces) == 1 and len(starts) == len(order):
+        return everything.take(order)
     return Piece(
         voxel=everything.voxel[order[starts]],
         count=_sum_runs(everything.count, order, starts),

@@ -22,6 +22,8 @@ STEP_M = 2.0**-13
 """Rounding of coordinates, 0.12 mm: a hundredth of a good LiDAR's noise."""
 INTENSITY_STEP = 2.0**-10
 
+FIRST_SLOTS = 1 << 19
+"""Room for one scan of a large LiDAR and the voxels of its neighbours, so that the table seldom grows."""
 MAX_VOXELS_PER_SIDE = 1024
 _TILE_BITS, _SIDE_BITS, _HEIGHT_BITS = 12, 10, 19
 _TILE_HALF, _HEIGHT_HALF = 1 << (_TILE_BITS - 1), 1 << (_HEIGHT_BITS - 1)
@@ -61,7 +63,7 @@ class VoxelSums:
         self._used = 0
         self._keys, self._records = np.empty(0, np.int64), np.empty((0, 8))
         self._scans = 0
-        self._rehash(1 << 16)
+        self._rehash(FIRST_SLOTS)
 
     def __len__(self) -> int:
         return self._used
@@ -111,7 +113,7 @@ class VoxelSums:
     def tiles(self) -> list[TileSums]:
         """All voxels, tile by tile, ordered by tile and voxel."""
         keys = self._keys[: self._used]
-        order = np.argsort(keys, kind="stable")
+        order = np.argsort(keys)
         keys = keys[order]
         starts = np.flatnonzero(np.diff(keys >> _TILE_SHIFT, prepend=_EMPTY))
         ends = np.append(starts[1:], len(keys))
