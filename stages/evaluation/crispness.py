@@ -59,8 +59,8 @@ def _spread(counts: list[int], samples: int, seed: int) -> list[NDArray[np.int64
 def _filled_squares(points: NDArray[np.float32]) -> int:
     if len(points) == 0:
         return 0
-    cells = np.floor(points[:, :2]).astype(np.int64)
-    cells -= cells.min(axis=0)
-    filled = np.zeros(cells.max(axis=0) + 1, bool)
-    filled[cells[:, 0], cells[:, 1]] = True
+    x, y = np.floor(points[:, 0]).astype(np.int64), np.floor(points[:, 1]).astype(np.int64)
+    x, y = x - x.min(), y - y.min()
+    filled = np.zeros((x.max() + 1, y.max() + 1), bool)
+    filled[x, y] = True
     return int(filled.sum())

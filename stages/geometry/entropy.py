@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8
 
+REACH = 2
+"""Columns to look at on each side: they are half as wide as the largest radius."""
 _CONSTANT = 0.5 * 3.0 * np.log(2.0 * np.pi * np.e)
 
 
@@ -30,7 +32,7 @@ def point_entropies(
     if list(radii_m) != sorted(radii_m):
         raise ValueError(f"radii must increase: {radii_m}")
     radii = np.array(radii_m, float)
-    columns = _Columns(points, float(radii.max()))
+    columns = _Columns(points, float(radii.max()) / REACH)
     return _entropies(
         columns.points, columns.starts, columns.shape, columns.low, columns.size_m,
         points[queries].astype(np.float32), radii, min_neighbours,
@@ -50,14 +52,24 @@ class _Columns:
     """Points sorted into upright columns with a square base of edge `size_m`, by counting."""
 
     def __init__(self, points: NDArray[np.float32], size_m: float) -> None:
-        self.low = points[:, :2].min(axis=0).astype(float)
-        span = points[:, :2].max(axis=0) - self.low
+        x, y = points[:, 0], points[:, 1]
+        self.low = np.array([x.min(), y.min()], float)
+        span = np.array([x.max(), y.max()], float) - self.low
         self.size_m = max(size_m, float(span.max()) / 4096)
-        self.shape = (np.floor(span / self.size_m).astype(np.int64) + 1)[:2]
-        cells = np.floor((points[:, :2] - self.low) / self.size_m).astype(np.int64)
-        flat = cells[:, 0] * self.shape[1] + cells[:, 1]
+        self.shape = np.floor(span / self.size_m).astype(np.int64) + 1
+        flat = _cells(points, self.low, self.size_m, int(self.shape[1]))
         self.starts, order = _counting_sort(flat, int(self.shape.prod()))
         self.points = points[order]
+
+
+@kernel
+def _cells(points: NDArray[np.float32], low: F8, size_m: float, across: int) -> NDArray[np.int64]:
+    """Number of the column each point (n, 3) lies in, `across` columns to a row."""
+    out = np.empty(len(points), np.int64)
+    for n in range(len(points)):
+        row: Any = np.int64(np.floor((points[n, 0] - low[0]) / size_m))
+        out[n] = row * across + np.int64(np.floor((points[n, 1] - low[1]) / size_m))
+    return out
 
 
 @kernel
@@ -87,10 +99,10 @@ def _entropies(
         sums = np.zeros((len(radii), 10))  # count, x y z, xx xy xz yy yz zz about the query
         cx: Any = np.int64(np.floor((queries[i, 0] - low[0]) / size_m))
         cy: Any = np.int64(np.floor((queries[i, 1] - low[1]) / size_m))
-        for gx in range(max(cx - 1, 0), min(cx + 2, shape[0])):
+        for gx in range(max(cx - REACH, 0), min(cx + REACH + 1, shape[0])):
             first = gx * shape[1]
-            begin = starts[first + max(cy - 1, 0)]
-            end = starts[first + min(cy + 2, shape[1])]
+            begin = starts[first + max(cy - REACH, 0)]
+            end = starts[first + min(cy + REACH + 1, shape[1])]
             _gather(points, begin, end, queries[i], squared_radii, sums)
         for k in range(len(radii)):
             if k > 0:
@@ -110,6 +122,8 @@ def _gather(
         y = float(points[j, 1]) - float(query[1])
         z = float(points[j, 2]) - float(query[2])
         squared = x * x + y * y + z * z
+        if squared > squared_radii[-1]:
+            continue
         for k in range(len(squared_radii)):
             if squared <= squared_radii[k]:
                 sums[k, 0] += 1.0
