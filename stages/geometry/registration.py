@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scanloom.stages.geometry.halves import in_halves
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8, se3_exp
 from scanloom.stages.geometry.voxel_map import F4, I4, I8, STEPS, VoxelMap, fit_surface, nearest
@@ -26,6 +27,7 @@ SETTLING = 8
 SETTLED = 10.0
 """Partners may swap to and fro for ever: after this many searches, steps this many times larger count as none."""
 MIN_MATCHES = 20
+BOUND_SLACK, BOUND_SLACK_M2 = 1.0 + 1e-6, 1e-9
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,8 @@ class _Partners:
     """For each source point: mean and direction of its partner's surface in the target, and the weight of its shape."""
 
     def __init__(self, n: int) -> None:
+        self.voxel = np.full(n, -1, np.int64)
+        self.place = np.zeros(n, np.int64)
         self.mean = np.zeros((n, 3))
         self.normal = np.zeros((n, 3))
         self.shape = np.zeros(n)
@@ -124,10 +128,22 @@ class _Partners:
         self.weight = np.zeros(n)
 
     def search(self, target: VoxelMap, points: F8, T: F8, max_distance_m: float) -> None:
-        _search(
-            points, T, min(max_distance_m, target.voxel_size_m) ** 2, target.surface_radius_m**2, target.voxel_size_m,
-            target.inserts, target.refit_after, STEPS, target.keys, target.values, target.voxel_key, target.count,
-            target.offset, target.surface, target.fitted, self.mean, self.normal, self.shape,
+        size = target.voxel_size_m
+        table = (target.keys, target.values, target.voxel_key, target.count, target.offset)
+        limit2 = min(max_distance_m, size) ** 2
+        radius2 = target.surface_radius_m**2
+
+        def find(rows: slice) -> None:
+            _find(points[rows], T, limit2, size, STEPS, *table, self.voxel[rows], self.place[rows])
+
+        def fit(rows: slice) -> None:
+            _fit(stale[rows], radius2, size, STEPS, *table, target.surface)
+
+        in_halves(find, len(points))
+        stale = _stale(self.voxel, self.place, target.inserts, target.refit_after, target.fitted)
+        in_halves(fit, len(stale))
+        _gather(
+            self.voxel, self.place, size, target.voxel_key, target.surface, self.mean, self.normal, self.shape,
             self.normal_variance,
         )  # fmt: skip
 
@@ -178,26 +194,65 @@ def _result(
 
 
 @kernel
-def _search(
-    points: F8, T: F8, limit2: Float, radius2: Float, size: Float, inserts: Int, refit_after: Int, steps: I8,
-    keys: I8, values: I4, voxel_key: I8, count: I4, offset: F4, surface: F4, fitted: I4,
-    mean: F8, normal: F8, shape: F8, normal_variance: F8,
+def _find(
+    points: F8, T: F8, limit2: Float, size: Float, steps: I8, keys: I8, values: I4, voxel_key: I8, count: I4,
+    offset: F4, voxel: I8, place: I8,
 ) -> None:  # fmt: skip
-    a, vectors = np.empty((3, 3)), np.empty((3, 3))
+    """Partner of every point: its `voxel` and `place` in it, or voxel -1. The partner of before bounds the search."""
     for n in range(len(points)):
         px, py, pz = points[n, 0], points[n, 1], points[n, 2]
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
         y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        v, c, _ = nearest(x, y, z, limit2, size, steps, keys, values, count, offset)
+        bound2 = limit2
+        v = voxel[n]
+        if v >= 0:
+            i, j, k = unpack(voxel_key[v])
+            c = place[n]
+            dx, dy = offset[v, c, 0] + i * size - x, offset[v, c, 1] + j * size - y
+            dz = offset[v, c, 2] + k * size - z
+            # A hair more, so that rounding lets the search find the same point again.
+            bound2 = min(limit2, (dx * dx + dy * dy + dz * dz) * BOUND_SLACK + BOUND_SLACK_M2)
+        voxel[n], place[n], _ = nearest(x, y, z, bound2, size, steps, keys, values, count, offset)
+
+
+@kernel
+def _stale(voxel: I8, place: I8, inserts: Int, refit_after: Int, fitted: I4) -> I8:
+    """Partners (m, 2) whose surface has to be fitted, each once; they are marked as fitted."""
+    out = np.empty((len(voxel), 2), np.int64)
+    found = 0
+    for n in range(len(voxel)):
+        v, c = voxel[n], place[n]
+        if v >= 0 and inserts - fitted[v, c] > refit_after:
+            fitted[v, c] = inserts
+            out[found, 0], out[found, 1] = v, c
+            found += 1
+    return out[:found]
+
+
+@kernel
+def _fit(
+    stale: I8, radius2: Float, size: Float, steps: I8, keys: I8, values: I4, voxel_key: I8, count: I4, offset: F4,
+    surface: F4,
+) -> None:  # fmt: skip
+    a, vectors = np.empty((3, 3)), np.empty((3, 3))
+    for n in range(len(stale)):
+        fit_surface(
+            stale[n, 0], stale[n, 1], radius2, size, steps, keys, values, count, offset, voxel_key, surface, a,
+            vectors,
+        )  # fmt: skip
+
+
+@kernel
+def _gather(
+    voxel: I8, place: I8, size: Float, voxel_key: I8, surface: F4, mean: F8, normal: F8, shape: F8,
+    normal_variance: F8,
+) -> None:  # fmt: skip
+    for n in range(len(voxel)):
+        v, c = voxel[n], place[n]
         if v < 0:
             shape[n] = 0.0
             continue
-        if inserts - fitted[v, c] > refit_after:
-            fit_surface(
-                v, c, radius2, size, steps, keys, values, count, offset, voxel_key, surface, a, vectors
-            )
-            fitted[v, c] = inserts
         i, j, k = unpack(voxel_key[v])
         mean[n, 0] = i * size + surface[v, c, 0]
         mean[n, 1] = j * size + surface[v, c, 1]

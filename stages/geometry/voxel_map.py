@@ -254,9 +254,8 @@ def fit_surface(
     """Fit the surface at point c of voxel v to the stored points within the radius; `a`, `vectors` are scratch."""
     i, j, k = unpack(voxel_key[v])
     x, y, z = float(offset[v, c, 0]), float(offset[v, c, 1]), float(offset[v, c, 2])
-    a[:] = 0.0
-    sx = sy = sz = 0.0
-    n = 0
+    # Sums in scalars and without a branch: half of the points are within, which no processor can guess.
+    n = sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
     for s in range(27):
         di, dj, dk = steps[s, 0], steps[s, 1], steps[s, 2]
         if _gap2(x, di, size) + _gap2(y, dj, size) + _gap2(z, dk, size) >= radius2:
@@ -268,23 +267,19 @@ def fit_surface(
         px, py, pz = x - di * size, y - dj * size, z - dk * size
         for m in range(count[w]):
             dx, dy, dz = offset[w, m, 0] - px, offset[w, m, 1] - py, offset[w, m, 2] - pz
-            if dx * dx + dy * dy + dz * dz > radius2:
-                continue
-            n += 1
-            sx, sy, sz = sx + dx, sy + dy, sz + dz
-            a[0, 0] += dx * dx
-            a[0, 1] += dx * dy
-            a[0, 2] += dx * dz
-            a[1, 1] += dy * dy
-            a[1, 2] += dy * dz
-            a[2, 2] += dz * dz
+            within = 1.0 if dx * dx + dy * dy + dz * dz <= radius2 else 0.0
+            n += within
+            wx, wy, wz = within * dx, within * dy, within * dz
+            sx, sy, sz = sx + wx, sy + wy, sz + wz
+            xx, xy, xz = xx + wx * dx, xy + wx * dy, xz + wx * dz
+            yy, yz, zz = yy + wy * dy, yz + wy * dz, zz + wz * dz
     sx, sy, sz = sx / n, sy / n, sz / n
-    a[0, 0] = a[0, 0] / n - sx * sx
-    a[0, 1] = a[1, 0] = a[0, 1] / n - sx * sy
-    a[0, 2] = a[2, 0] = a[0, 2] / n - sx * sz
-    a[1, 1] = a[1, 1] / n - sy * sy
-    a[1, 2] = a[2, 1] = a[1, 2] / n - sy * sz
-    a[2, 2] = a[2, 2] / n - sz * sz
+    a[0, 0] = xx / n - sx * sx
+    a[0, 1] = a[1, 0] = xy / n - sx * sy
+    a[0, 2] = a[2, 0] = xz / n - sx * sz
+    a[1, 1] = yy / n - sy * sy
+    a[1, 2] = a[2, 1] = yz / n - sy * sz
+    a[2, 2] = zz / n - sz * sz
     eigen_symmetric_3(a, vectors)
     surface[v, c, 0], surface[v, c, 1], surface[v, c, 2] = x + sx, y + sy, z + sz
     for r in range(3):
