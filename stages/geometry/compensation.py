@@ -36,7 +36,7 @@ def compensate(
         return x_m, y_m, z_m
     step_ns = (last - first) / KNOTS
     knot_ns = first + np.round(step_ns * np.arange(KNOTS + 1)).astype(np.int64)
-    moved = track.poses(knot_ns, reference_ns, twist)[:, :3] - np.eye(4)[:3]
+    moved = np.ascontiguousarray(track.poses(knot_ns, reference_ns, twist)[:, :3] - np.eye(4)[:3])
     if not moved.any():
         return x_m, y_m, z_m
     return _displace(stamp_ns, x_m, y_m, z_m, first, 1.0 / step_ns, moved)
@@ -54,10 +54,17 @@ def _displace(
         place = min(max((stamp_ns[i] - first_ns) * per_ns, 0.0), float(last))
         k = min(int(place), last - 1)
         b = place - k
-        a = 1.0 - b
-        A, B = moved[k], moved[k + 1]
         px, py, pz = float(x[i]), float(y[i]), float(z[i])
-        out_x[i] = px + a * (A[0, 0] * px + A[0, 1] * py + A[0, 2] * pz + A[0, 3]) + b * (B[0, 0] * px + B[0, 1] * py + B[0, 2] * pz + B[0, 3])  # fmt: skip
-        out_y[i] = py + a * (A[1, 0] * px + A[1, 1] * py + A[1, 2] * pz + A[1, 3]) + b * (B[1, 0] * px + B[1, 1] * py + B[1, 2] * pz + B[1, 3])  # fmt: skip
-        out_z[i] = pz + a * (A[2, 0] * px + A[2, 1] * py + A[2, 2] * pz + A[2, 3]) + b * (B[2, 0] * px + B[2, 1] * py + B[2, 2] * pz + B[2, 3])  # fmt: skip
+        out_x[i] = px + _shift(moved, k, 0, b, px, py, pz)
+        out_y[i] = py + _shift(moved, k, 1, b, px, py, pz)
+        out_z[i] = pz + _shift(moved, k, 2, b, px, py, pz)
     return out_x, out_y, out_z
+
+
+@kernel
+def _shift(moved: F8, k: int, r: int, b: float, px: float, py: float, pz: float) -> float:
+    """Row r of D p, the share b of the way from knot k to the next."""
+    before = moved[k, r, 0] * px + moved[k, r, 1] * py + moved[k, r, 2] * pz + moved[k, r, 3]
+    after = moved[k + 1, r, 0] * px + moved[k + 1, r, 1] * py + moved[k + 1, r, 2] * pz + moved[k + 1, r, 3]
+    shift: float = (1.0 - b) * before + b * after
+    return shift

@@ -7,6 +7,7 @@ Two scans distorted alike fit each other well, so the first result is near the t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ POINTS_PER_VOXEL = 20
 TARGET_SPACING_M = 0.3
 SOURCE_SPACING_M = 1.0
 TARGET_POINTS = 40_000
-SOURCE_POINTS = 1200
+SOURCE_POINTS = 1000
 COARSE_SCALE_M, COARSE_STEPS = 0.5, 15
 FINE_SCALE_M, FINE_STEPS = 0.15, 4
 MOST_PASSES = 4
@@ -40,19 +41,31 @@ FIRST_SPEEDS_M_S = (0.0, 8.0, 16.0, 24.0, 32.0)
 """Forward speeds tried when nothing is known yet; the best fit is kept."""
 
 
+class Points(NamedTuple):
+    """Points of a scan with their stamps, all (n,)."""
+
+    stamp_ns: NDArray[np.int64]
+    x_m: NDArray[np.float32]
+    y_m: NDArray[np.float32]
+    z_m: NDArray[np.float32]
+
+    def take(self, rows: slice | NDArray[np.int64]) -> Points:
+        return Points(self.stamp_ns[rows], self.x_m[rows], self.y_m[rows], self.z_m[rows])
+
+
 @dataclass(frozen=True)
 class ThinScan:
     """A few points of a scan with their stamps: `dense` ones to be a target, `sparse` ones to be a source."""
 
     reference_ns: int
-    dense: Scan
-    sparse: Scan
+    dense: Points
+    sparse: Points
 
     @classmethod
     def of(cls, scan: Scan) -> ThinScan:
         stride = max(1, len(scan) // TARGET_POINTS) | 1  # odd, so that no beam of an even number is left out
-        some = scan.take(slice(None, None, stride))
-        points = some.points()
+        some = Points(scan.stamp_ns, scan.x_m, scan.y_m, scan.z_m).take(slice(None, None, stride))
+        points = np.column_stack(some[1:])
         dense = downsample(points, TARGET_SPACING_M)
         sparse = dense[downsample(points[dense], SOURCE_SPACING_M)]
         fewer = sparse[:: max(1, -(-len(sparse) // SOURCE_POINTS))]
@@ -65,12 +78,12 @@ def twist_between(a: ThinScan, b: ThinScan, track: MotionTrack, guess: F8 | None
     guess : twist of the pair before, if any. Rotation and translation that `track` covers are used as they are.
     """
     pause_s = (b.reference_ns - a.reference_ns) * 1e-9
-    if not 0 < pause_s < LONGEST_PAUSE_S or min(len(a.sparse), len(b.sparse)) < 100:
+    if not 0 < pause_s < LONGEST_PAUSE_S or min(len(a.sparse.x_m), len(b.sparse.x_m)) < 100:
         return None
     twist = guess if guess is not None else _first_guess(a, b, track)
     for _ in range(MOST_PASSES):
         found = _register(a, b, track, twist, FINE_SCALE_M, FINE_STEPS)
-        if not _fits(found, len(b.sparse)):
+        if not _fits(found, len(b.sparse.x_m)):
             return None
         before, twist = twist, se3_log(found.T_target_source) / pause_s
         if _settled(twist - before):
@@ -96,18 +109,19 @@ def _first_guess(a: ThinScan, b: ThinScan, track: MotionTrack) -> F8:
 def _register(
     a: ThinScan, b: ThinScan, track: MotionTrack, twist: F8, scale_m: float, iterations: int
 ) -> Registration:
-    voxel_m = FINE_VOXEL_M if len(a.dense) > DENSE_POINTS else COARSE_VOXEL_M
+    voxel_m = FINE_VOXEL_M if len(a.dense.x_m) > DENSE_POINTS else COARSE_VOXEL_M
     target = VoxelMap(voxel_m, POINTS_PER_VOXEL)
-    target.insert(_compensated(a.dense, track, twist))
+    target.insert(_compensated(a.dense, a.reference_ns, track, twist))
     return align(
-        target, _compensated(b.sparse, track, twist), track.relative(a.reference_ns, b.reference_ns, twist),
+        target, _compensated(b.sparse, b.reference_ns, track, twist), track.relative(a.reference_ns, b.reference_ns, twist),
         max_distance_m=voxel_m, scale_m=scale_m, max_iterations=iterations,
     )  # fmt: skip
 
 
-def _compensated(scan: Scan, track: MotionTrack, twist: F8) -> NDArray[np.float64]:
-    xyz = compensate(scan.stamp_ns, scan.x_m, scan.y_m, scan.z_m, scan.reference_ns, track, twist)
-    return np.column_stack(xyz).astype(np.float64)
+def _compensated(points: Points, reference_ns: int, track: MotionTrack, twist: F8) -> F8:
+    out = np.empty((len(points.x_m), 3))
+    out.T[:] = compensate(*points, reference_ns, track, twist)
+    return out
 
 
 def _fits(found: Registration, tried: int) -> bool:
