@@ -113,15 +113,29 @@ def _shade(
     top: NDArray[np.float32], above: NDArray[np.float32], bright: NDArray[np.float32], pixel_m: float
 ) -> NDArray[np.uint8]:
     light = _depth_light(top, pixel_m)
-    place = np.clip(above / _TALL_M, 0, 1) * (len(_RAMP) - 1)
-    i = np.minimum(place.astype(int), len(_RAMP) - 2)
-    share = (place - i)[..., None]
-    colour = _RAMP[i] * (1 - share) + _RAMP[i + 1] * share
-    colour *= np.where(above < 0.4, 0.65 + 1.0 * bright, 1.0)[..., None] * light[..., None]
-    empty = ~np.isfinite(top)
-    colour[empty] = BACKGROUND
-    image: NDArray[np.uint8] = np.clip(colour, 0, 255).astype(np.uint8)
+    image = np.empty((*top.shape, 3), np.uint8)
+    image[:] = BACKGROUND
+    _colour(top, above, bright, light, _RAMP, image)
     return image
+
+
+@kernel
+def _colour(
+    top: NDArray[np.float32], above: NDArray[np.float32], bright: NDArray[np.float32], light: NDArray[np.float32],
+    ramp: NDArray[np.float64], image: NDArray[np.uint8],
+) -> None:  # fmt: skip
+    """Colour of every filled pixel by its height above ground; ground is as bright as it reflects."""
+    for y in range(top.shape[0]):
+        for x in range(top.shape[1]):
+            if not np.isfinite(top[y, x]):
+                continue
+            place = min(max(above[y, x] / _TALL_M, 0.0), 1.0) * (len(ramp) - 1)
+            i = min(int(place), len(ramp) - 2)
+            share = place - i
+            strength = light[y, x] * (0.65 + bright[y, x] if above[y, x] < 0.4 else 1.0)
+            for c in range(3):
+                value = (ramp[i, c] * (1.0 - share) + ramp[i + 1, c] * share) * strength
+                image[y, x, c] = np.uint8(min(max(value, 0.0), 255.0))
 
 
 @kernel

@@ -174,7 +174,7 @@ def _charts(error_track: Parts[ErrorTrack]) -> dict[str, str]:
 
 def _png(image: Image.Image) -> bytes:
     buffer = io.BytesIO()
-    image.save(buffer, "PNG", compress_level=5)
+    image.save(buffer, "PNG", compress_level=3)
     return buffer.getvalue()
 
 
