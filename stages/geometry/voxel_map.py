@@ -294,7 +294,7 @@ LEAST_WIDTH2 = 0.1**2
 
 
 @kernel
-def shape_weight(small: Float, middle: Float, large: Float, n: Int) -> Float:
+def shape_weight(small: Float, middle: Float, large: Float, n: Float) -> Float:
     """Weight of a residual along the normal, from the eigenvalues (m2) of the n points around.
 
     1 on a clean plane and falling with its roughness; 0 where the points are too few or form a line, since a line of

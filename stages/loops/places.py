@@ -14,6 +14,7 @@ from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
 from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.geometry.kernels import kernel
+from scanloom.stages.geometry.lookahead import ahead
 from scanloom.stages.loops.reading import keyframe_scans
 
 VERSION = 1
@@ -46,7 +47,7 @@ def places(
     stamp = dict(zip(odometry.scan_index.tolist(), odometry.stamp_ns.tolist(), strict=True))
     wanted = set(odometry.scan_index[odometry.keyframe].tolist())
     indices, found = [], []
-    for scan, label in keyframe_scans(deskewed, labels, wanted):
+    for scan, label in ahead(keyframe_scans(deskewed, labels, wanted)):
         indices.append(scan.scan_index)
         found.append(scan_context(scan, label, settings))
     return Places(
