@@ -176,7 +176,7 @@ def sweep_times(
 
 
 @kernel
-def _rows_by_wrap(x: NDArray[np.float32], y: NDArray[np.float32], least: int, out: NDArray[np.int64]) -> int:
+def _rows_by_wrap(x: NDArray[np.float32], y: NDArray[np.float32], least: int, out: NDArray[np.uint16]) -> int:
     """Number of the row of each point: a new row where the azimuth in [0, 2 pi) falls by more than half a turn."""
     row, since = 0, 0
     last = 0.0
@@ -206,19 +206,19 @@ def rings_by_wrap(
     x, y, z : (n,) coordinates in the LiDAR's frame, m.
     beams : number of beams when known (64 for KITTI), so that a lost row does not shift the others from above.
     """
-    row = np.zeros(len(x), np.int64)
+    row = np.zeros(len(x), np.uint16)
     count = _rows_by_wrap(x, y, max(16, len(x) // 2000), row)
     if not 4 <= count <= 260:
         return np.zeros(len(x), np.uint16)
     last = max(count, beams or 0) - 1
     if beams is not None:
-        row = np.minimum(row, beams - 1)
+        row = np.minimum(row, np.uint16(beams - 1))
         last = beams - 1
     sample = slice(None, None, max(1, len(x) // 4000))
-    trend = elevation_trend(x[sample], y[sample], z[sample], row[sample])
+    trend = elevation_trend(x[sample], y[sample], z[sample], row[sample].astype(np.int64))
     if abs(trend) < 0.5:
         return np.zeros(len(x), np.uint16)
-    return (row if trend > 0 else last - row).astype(np.uint16)
+    return row if trend > 0 else np.uint16(last) - row
 
 
 def elevation_trend(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scanloom.schemas.errors import InvalidInput
 from scanloom.schemas.scans import Scan
 from scanloom.schemas.session import Problem, Severity
+from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.logs.options import Settings
 from scanloom.stages.logs.pointcloud import (
     azimuth_times,
@@ -229,9 +230,13 @@ def _decode(message: CloudMessage) -> Cloud:
 
 def _returns(cloud: Cloud) -> NDArray[np.bool_]:
     """Points that are measurements: not NaN, not beyond any LiDAR, not the zeros that drivers write for no return."""
-    x, y, z = cloud.x_m, cloud.y_m, cloud.z_m
-    near: NDArray[np.bool_] = (
-        (np.abs(x) < _FARTHEST_M) & (np.abs(y) < _FARTHEST_M) & (np.abs(z) < _FARTHEST_M)
-    )
-    seen: NDArray[np.bool_] = near & ((x != 0) | (y != 0) | (z != 0))
-    return seen
+    return _measured(cloud.x_m, cloud.y_m, cloud.z_m)
+
+
+@kernel
+def _measured(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32]) -> NDArray[np.bool_]:
+    out = np.empty(len(x), np.bool_)
+    for i in range(len(x)):
+        near = (abs(x[i]) < _FARTHEST_M) & (abs(y[i]) < _FARTHEST_M) & (abs(z[i]) < _FARTHEST_M)
+        out[i] = near & ((x[i] != 0) | (y[i] != 0) | (z[i] != 0))
+    return out
