@@ -196,6 +196,7 @@ def _local(workers: int | None, modules: Sequence[str]) -> tuple[Any, Any]:
             "distributed.worker.multiprocessing-method": "forkserver",
             "distributed.nanny.preload": [],
             "distributed.nanny.environ": THREADS,
+            "distributed.nanny.pre-spawn-environ": {},
             "distributed.admin.tick.limit": "1h",
             "distributed.comm.timeouts.connect": "60s",
         }

@@ -9,7 +9,7 @@ from typing import Any
 
 from scanloom.pipeline.fingerprint import SCHEMA, code_version, digest, files_digest
 from scanloom.pipeline.flow import Flow, Input, Source, Task
-from scanloom.pipeline.node import Node
+from scanloom.pipeline.node import ALONE, Node
 from scanloom.pipeline.store import Store
 from scanloom.pipeline.task import Json, import_path
 from scanloom.schemas.errors import InvalidInput
@@ -65,6 +65,7 @@ class Identifier:
             "circumstances": self._circumstances,
             "reads": reads,
             "writes": [import_path(product) for product in node.writes],
+            "overlap": node.per in ALONE,
         }
         return Order(key, identity, spec, inputs)
 

@@ -25,6 +25,11 @@ plus the axis it is split along (`SPLIT_BY`). A task reads the parts that agree 
 a single product when the part has no axis the task lacks, else `Parts`, ordered."""
 
 
+ALONE = frozenset({"session", "map"})
+"""Fan-outs of which few tasks run at a time, so that cores are free for reading ahead and writing behind. Where tasks are
+as many as cores, those threads only get in each other's way."""
+
+
 @dataclass(frozen=True)
 class Node:
     """One stage of a workflow. `settings` and `version` come from the stage's module."""

@@ -105,7 +105,7 @@ def _compute(spec: Json, started: float, memory: PeakMemory) -> None:
     stage = imported(spec["stage"])
     _check_code(spec["identity"]["code"]["modules"])
     settings = imported(spec["settings_model"]).model_validate(spec["identity"]["settings"])
-    products = [_opened(entry) for entry in spec["reads"]]
+    products = [_opened(entry, spec["overlap"]) for entry in spec["reads"]]
     with store.draft(spec["identity"]["stage"], spec["key"]) as draft:
         _write(draft, stage(settings, *products), spec)
         run = {
@@ -130,21 +130,21 @@ def _check_code(modules: Mapping[str, str]) -> None:
         )
 
 
-def _opened(entry: Json) -> Any:
+def _opened(entry: Json, overlap: bool) -> Any:
     """One argument of the stage: a product, or `Parts` that open theirs when asked."""
     product: type[Product] = imported(entry["product"])
-    load = partial(_open, product)
+    load = partial(_open, product, overlap)
     parts: list[tuple[Coordinate, Any]] = [
         (tuple((axis, value) for axis, value in part["coordinate"]), part) for part in entry["parts"]
     ]
     return load(parts[0][1]) if entry["plain"] else Parts(parts, load=load)
 
 
-def _open(product: type[Product], part: Json) -> Product:
+def _open(product: type[Product], overlap: bool, part: Json) -> Product:
     path = Path(part["path"])
     if "names" in part and issubclass(product, Files):
         return product(root=path, names=tuple(part["names"]))
-    if issubclass(product, Stream):
+    if overlap and issubclass(product, Stream):
         return product.open(path, read_ahead)
     return product.open(path)
 
@@ -162,7 +162,7 @@ def _write(draft: Draft, returned: Any, spec: Json) -> None:
         split = product.SPLIT_BY is not None and product.SPLIT_BY not in axes
         if split != isinstance(item, Part):
             raise ProductError(f"{product.NAME} must {'' if split else 'not '}be returned as `Part`s")
-        if isinstance(product, Stream):
+        if spec["overlap"] and isinstance(product, Stream):
             write_behind(product, partial(draft.write, key=key))
         else:
             draft.write(product, key)
