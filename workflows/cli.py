@@ -98,7 +98,7 @@ def _start_workers(cluster: str, *, idle: bool = False) -> None:
     if cluster == "local" and not idle:
         from scanloom.pipeline.forkserver import start_forkserver
 
-        start_forkserver(["scanloom.workflows.map_session"])
+        start_forkserver(["scanloom.workflows.warm_workers"])
 
 
 @app.command("map")

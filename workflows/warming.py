@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from scanloom.stages.geometry.kernels import CACHE_FOLDER
+from scanloom.stages.geometry.kernels import CACHE_FOLDER, remember_signatures
 from scanloom.workflows.build_map import Order, build_map
 from scanloom.workflows.sessions import SAMPLE
 
@@ -31,5 +31,5 @@ def warm_kernels() -> None:
         outcome = build_map(order)
     for _, error in outcome.failures:
         raise error
-    MARKER.parent.mkdir(parents=True, exist_ok=True)
+    remember_signatures()
     MARKER.touch()
