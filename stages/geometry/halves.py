@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-WORTH_IT = 500
+WORTH_IT = 1200
 """Rows from which on the second thread is asked: below, waking it takes longer than the work."""
 
 _helper = ThreadPoolExecutor(1, thread_name_prefix="second half")

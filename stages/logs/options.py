@@ -62,7 +62,7 @@ class Settings(BaseModel):
     wheel_on_base: Mounting = Field(default=None, description=f"point whose speed is measured: {_MOUNT}")
     chunk_s: float = Field(default=20.0, ge=1, le=600, description="length of a chunk, s")
     chunk_points: int = Field(
-        default=2_000_000,
+        default=3_000_000,
         ge=1000,
         le=200_000_000,
         description="a chunk ends earlier when it holds this many points",
