@@ -119,7 +119,7 @@ def _imports(module: str) -> frozenset[str]:
     path, _ = _module_source(module)
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     names: set[str] = set()
-    for statement in ast.walk(ast.parse(path.read_bytes(), filename=str(path))):
+    for statement in _statements(ast.parse(path.read_bytes(), filename=str(path))):
         if isinstance(statement, ast.Import):
             for alias in statement.names:
                 names.update([*_parents(alias.name), alias.name])
@@ -130,6 +130,15 @@ def _imports(module: str) -> frozenset[str]:
     return frozenset(names)
 
 
+def _statements(node: ast.AST) -> Iterator[ast.AST]:
+    """All statements below a node, also nested ones; expressions hold no imports and are passed over."""
+    for block in ("body", "orelse", "finalbody", "handlers", "cases"):
+        inner = getattr(node, block, ())
+        for statement in inner if isinstance(inner, list) else ():
+            yield statement
+            yield from _statements(statement)
+
+
 def _absolute(statement: ast.ImportFrom, package: str) -> str:
     if not statement.level:
         return statement.module or ""
@@ -138,22 +147,31 @@ def _absolute(statement: ast.ImportFrom, package: str) -> str:
     return ".".join([*base, *([statement.module] if statement.module else [])])
 
 
-@cache
 def _is_module(name: str) -> bool:
+    return _file_of(name) is not None
+
+
+@cache
+def _file_of(name: str) -> Path | None:
+    """Source file of a module, found without importing anything of its package (`find_spec` would import the parents)."""
+    parent, _, leaf = name.rpartition(".")
+    package = _file_of(parent) if parent else None
+    if package is not None:
+        inside = (package.parent / f"{leaf}.py", package.parent / leaf / "__init__.py")
+        return next((path for path in inside if package.name == "__init__.py" and path.is_file()), None)
     try:
         spec = importlib.util.find_spec(name)
     except (ImportError, AttributeError, ValueError):
-        return False
-    return spec is not None and spec.origin is not None and spec.origin.endswith(".py")
+        return None
+    return Path(spec.origin) if spec is not None and spec.origin and spec.origin.endswith(".py") else None
 
 
 @cache
 def _module_source(name: str) -> tuple[Path, str]:
     """File of a module and the digest of its bytes, taken once per process, near its import."""
-    spec = importlib.util.find_spec(name)
-    if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
+    path = _file_of(name)
+    if path is None:
         raise UsageError(f"the source of module {name} cannot be found", next_step="declare stages in a file")
-    path = Path(spec.origin)
     return path, _source_digest(path)
 
 
