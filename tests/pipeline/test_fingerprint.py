@@ -14,7 +14,7 @@ from scanloom.pipeline.fingerprint import (
     FileHashes,
     _closure,
     _imports,
-    _is_module,
+    _file_of,
     _module_source,
     canonical,
     code_version,
@@ -55,7 +55,7 @@ def plant(tmp_path: Path) -> Path:
 
 def fingerprint(plant: Path) -> dict:
     """As a new process would see it: code is looked at once per process."""
-    for memory in (_closure, _imports, _is_module, _module_source):
+    for memory in (_closure, _imports, _file_of, _module_source):
         memory.cache_clear()
     for name in [name for name in sys.modules if name.partition(".")[0] == "plant"]:
         del sys.modules[name]
