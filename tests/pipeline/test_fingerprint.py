@@ -13,8 +13,8 @@ import pytest
 from scanloom.pipeline.fingerprint import (
     FileHashes,
     _closure,
-    _imports,
     _file_of,
+    _imports,
     _module_source,
     canonical,
     code_version,
