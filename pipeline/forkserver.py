@@ -31,6 +31,7 @@ def start_forkserver(modules: Sequence[str]) -> None:
         "scanloom.pipeline.local_worker",
         "distributed",
         "scanloom.pipeline.task",
+        "pyarrow.compute",
         "pyarrow.parquet",
         "numpy.random",
     ]
