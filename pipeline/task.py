@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import importlib
 import os
 import socket
@@ -46,6 +48,7 @@ def execute(spec: Json) -> Json:
             error = None
         except Exception as problem:
             error = describe_error(problem, spec["place"])
+    release_memory()
     return {
         "error": error,
         "wall_s": time.perf_counter() - started,
@@ -53,6 +56,17 @@ def execute(spec: Json) -> Json:
         "pid": os.getpid(),
         "host": socket.gethostname(),
     }
+
+
+def release_memory() -> None:
+    """Give freed memory back to the system once a task is over, so that a worker does not grow with the number of tasks."""
+    import pyarrow as pa
+
+    gc.collect()
+    pa.default_memory_pool().release_unused()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc
+    if trim is not None:
+        trim(0)
 
 
 def limit_threads() -> None:
