@@ -17,7 +17,7 @@ from scanloom.stages.tiling.grid import tile_position
 
 VERSION = 1
 
-ROWS_AT_ONCE = 500_000
+ROWS_AT_ONCE = 150_000
 """Voxels that wait to be merged."""
 
 
@@ -64,7 +64,7 @@ def merge_all(name: str, pieces: Iterable[Piece]) -> Piece:
                 next_step="run tiling again for all sessions with the same settings",
             )
         waiting.append(piece)
-        if sum(map(len, waiting)) > 2 * len(waiting[0]) + ROWS_AT_ONCE:
+        if sum(map(len, waiting[1:])) > len(waiting[0]) // 4 + ROWS_AT_ONCE:
             waiting = [merge(waiting)]
     return merge(waiting)
 
