@@ -71,20 +71,25 @@ def merge_all(name: str, pieces: Iterable[Piece]) -> Piece:
 
 def merge(pieces: list[Piece]) -> Piece:
     """Add up pieces of one tile voxel by voxel; voxels come out ordered by (x, y, z) index."""
-    everything = Piece.concatenate(pieces)
-    keys = _keys(everything.voxel)
+    voxel = np.concatenate([piece.voxel for piece in pieces])
+    keys = _keys(voxel)
     order = np.argsort(keys, kind="stable")  # timsort: the pieces come sorted, so this is a merge
     starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
     if len(pieces) == 1 and len(starts) == len(order):
-        return everything.take(order)
+        return pieces[0].take(order)
+
+    def total(column: str) -> NDArray:
+        """One column at a time: a dense tile is large."""
+        return _sum_runs(np.concatenate([getattr(piece, column) for piece in pieces]), order, starts)
+
     return Piece(
-        voxel=everything.voxel[order[starts]],
-        count=_sum_runs(everything.count, order, starts),
-        sum_m=_sum_runs(everything.sum_m, order, starts),
-        sum_intensity=_sum_runs(everything.sum_intensity, order, starts),
-        ground_count=_sum_runs(everything.ground_count, order, starts),
-        scan_count=_sum_runs(everything.scan_count, order, starts),
-        **everything.attributes,
+        voxel=voxel[order[starts]],
+        count=total("count"),
+        sum_m=total("sum_m"),
+        sum_intensity=total("sum_intensity"),
+        ground_count=total("ground_count"),
+        scan_count=total("scan_count"),
+        **pieces[0].attributes,
     )
 
 
