@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import gc
 import importlib
 import os
 import socket
@@ -62,7 +61,6 @@ def release_memory() -> None:
     """Give freed memory back to the system once a task is over, so that a worker does not grow with the number of tasks."""
     import pyarrow as pa
 
-    gc.collect()
     pa.default_memory_pool().release_unused()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc
     if trim is not None:
