@@ -37,6 +37,10 @@ def imported(path: str) -> Any:
     return found
 
 
+LARGE_MB = 450.0
+"""A worker that grew beyond this gives memory back after the task; below, keeping it saves the next task time."""
+
+
 def execute(spec: Json) -> Json:
     """Run one task; JSON in, JSON out. A failure is part of the answer, so that it survives the way back."""
     limit_threads()
@@ -47,7 +51,8 @@ def execute(spec: Json) -> Json:
             error = None
         except Exception as problem:
             error = describe_error(problem, spec["place"])
-    release_memory()
+    if memory.peak_mb > LARGE_MB:
+        release_memory()
     return {
         "error": error,
         "wall_s": time.perf_counter() - started,
