@@ -17,7 +17,7 @@ THREADS = {
 }
 """Environment of local workers: one native thread each.
 
-Dask's MALLOC_TRIM_THRESHOLD_ is left out: giving every freed cloud back to the system made the stages take half as long again.
+Dask's MALLOC_TRIM_THRESHOLD_ is left out: giving every freed cloud back to the system made deskew take half as long again.
 """
 
 

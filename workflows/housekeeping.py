@@ -8,8 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from scanloom.pipeline import inspection, upkeep
-from scanloom.pipeline.store import Store
+from scanloom.pipeline.store import Store, explain
 from scanloom.schemas.errors import UsageError
 
 Json = dict[str, Any]
@@ -25,7 +24,7 @@ def _open(folder: Path) -> Store:
 
 def explanation(store: Path, artifact: str) -> Json:
     """Why one artifact is what it is. `artifact` is a key, the start of one, or the artifact's folder."""
-    found = inspection.explain(_open(store), Path(artifact).name if "/" in artifact else artifact)
+    found = explain(_open(store), Path(artifact).name if "/" in artifact else artifact)
     outputs = [
         {"path": f.path, "bytes": f.size, "sha256": f.sha256}
         for part in found.artifact.parts
@@ -65,7 +64,7 @@ def text_of_explanation(found: Json) -> str:
 
 def store_status(store: Path) -> Json:
     """What the store holds, and how the last runs ended."""
-    found = inspection.status(_open(store))
+    found = _open(store).status()
     return {
         "root": str(found.root),
         "bytes": found.bytes,
@@ -98,7 +97,7 @@ def verify_store(store: Path) -> Json:
     """Every byte read again; damaged artifacts are set aside."""
     opened = _open(store)
     checked = sum(1 for _ in opened.artifacts())
-    problems = upkeep.verify(opened)
+    problems = opened.verify()
     return {
         "checked": checked,
         "problems": [f"{p.stage}/{p.key}: {p.path}: {p.what}; moved to {p.moved_to}" for p in problems],
@@ -107,7 +106,7 @@ def verify_store(store: Path) -> Json:
 
 def collect_garbage(store: Path, keep_runs: int, dry_run: bool) -> Json:
     """Drop what the last runs did not use."""
-    garbage = upkeep.gc(_open(store), keep_runs=keep_runs, dry_run=dry_run)
+    garbage = _open(store).gc(keep_runs=keep_runs, dry_run=dry_run)
     return {
         "artifacts": len(garbage.artifacts),
         "leftovers": len(garbage.leftovers),
