@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
-from scanloom.stages.geometry.kernels import kernel
-from scanloom.stages.geometry.se3 import F8, inverse, so3_exp
+from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.travel import travel
 
 I8 = NDArray[np.int64]
 
@@ -37,8 +37,8 @@ STILL_ACCEL_STD_M_S2 = 0.25
 MAX_BIAS_RAD_S = 0.05
 LEAST_SAMPLES = 8
 MAX_MEAN_TILT_RAD = np.radians(45.0)
-LONGEST_STEP_NS = 20_000_000
 NOTHING = np.zeros((0, 2), np.int64)
+NO_STAMPS = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class MotionTrack:
             )
         return cls(
             imu_ns, rate, wheel_ns, speed * wheel_scale, np.array(session.T_base("lidar")),
-            np.array(session.T_base("wheel"))[:3, 3], bias, still,
+            np.array(session.T_base("wheel"))[:3, 3].copy(), bias, still,
             round(max_gyro_gap_s * 1e9), round(max_wheel_gap_s * 1e9),
         )  # fmt: skip
 
@@ -128,71 +128,22 @@ class MotionTrack:
             return np.zeros((0, 4, 4))
         first, last = min(int(at_ns.min()), reference_ns), max(int(at_ns.max()), reference_ns)
         cover = self.covers(first, last)
-        node_ns = self._nodes(at_ns, reference_ns, first, last)
-        rate, velocity = self._rates(node_ns, cover, twist)
-        T_first_base = integrate(1e-9 * (node_ns - first).astype(np.float64), rate, velocity)
-        T_reference_base = inverse(T_first_base[np.searchsorted(node_ns, reference_ns)]) @ T_first_base
-        moved = T_reference_base[np.searchsorted(node_ns, at_ns)] - np.eye(4)
-        T_reference_lidar: F8 = np.eye(4) + inverse(self.T_base_lidar) @ moved @ self.T_base_lidar
+        rate, velocity, point = self._constant(cover, twist)
+        T_reference_lidar: F8 = travel(
+            at_ns, reference_ns, first, last, self.gyro_ns if cover.rotation else NO_STAMPS, self.rate_base,
+            self.wheel_ns if cover.translation else NO_STAMPS, self.speed_m_s, rate, velocity, point, self.T_base_lidar,
+        )  # fmt: skip
         return T_reference_lidar
 
-    def _nodes(self, at_ns: I8, reference_ns: int, first: int, last: int) -> I8:
-        """Times at which the motion is evaluated: those asked for, the measurements, and none far apart."""
-        steps = np.arange(first, last, LONGEST_STEP_NS, dtype=np.int64)
-        gyro = _within(self.gyro_ns, first, last)
-        wheel = _within(self.wheel_ns, first, last)
-        return np.unique(np.concatenate((at_ns, [reference_ns], steps, gyro, wheel)).astype(np.int64))
-
-    def _rates(self, node_ns: I8, cover: Coverage, twist: F8 | None) -> tuple[F8, F8]:
-        """Angular rate and velocity (k, 3) of the base origin in the base frame."""
+    def _constant(self, cover: Coverage, twist: F8 | None) -> tuple[F8, F8, F8]:
+        """Angular rate, velocity, and the point of the base that has it, for what the sensors do not tell."""
         R, lever = self.T_base_lidar[:3, :3], self.T_base_lidar[:3, 3]
-        rate, velocity = np.zeros((2, len(node_ns), 3))
-        if cover.rotation:
-            rate = np.column_stack([_sample(self.gyro_ns, self.rate_base[:, k], node_ns) for k in range(3)])
-        elif twist is not None:
-            rate = rate + R @ twist[:3]
+        rate = np.zeros(3) if twist is None else R @ twist[:3]
         if cover.translation:
-            velocity[:, 0] = _sample(self.wheel_ns, self.speed_m_s, node_ns)
-            velocity = velocity - np.cross(rate, self.wheel_position)
-        elif twist is not None:
-            velocity = velocity + R @ twist[3:] - np.cross(rate, lever)
-        return rate, velocity
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-
-
-def integrate(time_s: F8, rate: F8, velocity: F8) -> F8:
-    """Poses T_0_k (n, 4, 4) at increasing times (n,) from body rates (n, 3), rad/s, and body velocities (n, 3), m/s.
-
-    R_{k+1} = R_k Exp(w dt), p_{k+1} = p_k + R_k Exp(w dt / 2) v dt with the mean w, v of the two ends (methods 1.4).
-    """
-    dt = np.diff(time_s)[:, None]
-    half = so3_exp(0.5 * dt * 0.5 * (rate[:-1] + rate[1:]))
-    moved = dt * 0.5 * (velocity[:-1] + velocity[1:])
-    T = np.zeros((len(time_s), 4, 4))
-    T[:] = np.eye(4)
-    _chain(half, moved, T)
-    return T
-
-
-@kernel
-def _chain(half: F8, moved: F8, T: F8) -> None:
-    """Compose half-step rotations (n - 1, 3, 3) and body displacements (n - 1, 3) into poses T (n, 4, 4)."""
-    for k in range(len(half)):
-        for i in range(3):
-            shift = 0.0
-            for j in range(3):
-                middle = 0.0
-                for m in range(3):
-                    middle += T[k, i, m] * half[k, m, j]
-                T[k + 1, i, j] = middle
-                shift += middle * moved[k, j]
-            T[k + 1, i, 3] = T[k, i, 3] + shift
-        for i in range(3):
-            a, b, c = T[k + 1, i, 0], T[k + 1, i, 1], T[k + 1, i, 2]
-            for j in range(3):
-                T[k + 1, i, j] = a * half[k, 0, j] + b * half[k, 1, j] + c * half[k, 2, j]
+            return rate, np.zeros(3), self.wheel_position
+        if twist is None:
+            return rate, np.zeros(3), np.zeros(3)
+        return rate, R @ twist[3:], lever.copy()
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -294,16 +245,3 @@ def _without_gap(stamp_ns: I8, start: int, end: int, longest_ns: int) -> bool:
     i = max(int(np.searchsorted(stamp_ns, start, side="right")) - 1, 0)
     j = min(int(np.searchsorted(stamp_ns, end)), len(stamp_ns) - 1)
     return j <= i or bool(np.diff(stamp_ns[i : j + 1]).max() <= longest_ns)
-
-
-def _within(stamp_ns: I8, first: int, last: int) -> I8:
-    return stamp_ns[np.searchsorted(stamp_ns, first) : np.searchsorted(stamp_ns, last, side="right")]
-
-
-def _sample(stamp_ns: I8, value: F8, at_ns: I8) -> F8:
-    """Linear interpolation; the end values are held. Only the samples around the wanted times are touched."""
-    i = max(int(np.searchsorted(stamp_ns, at_ns[0], side="right")) - 1, 0)
-    j = int(np.searchsorted(stamp_ns, at_ns[-1])) + 1
-    origin = stamp_ns[i]
-    sampled: F8 = np.interp((at_ns - origin) * 1e-9, (stamp_ns[i:j] - origin) * 1e-9, value[i:j])
-    return sampled
