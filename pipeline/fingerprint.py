@@ -196,6 +196,10 @@ def _library_version(name: str) -> str:
 # --- source files ---------------------------------------------------------------------------------------------------
 
 
+Mark = tuple[str, int, int, int]
+"""By which a file is known again: path, size, modification time in ns, inode."""
+
+
 class FileHashes:
     """Digests of files outside the store, remembered by path, size, modification time and inode.
 
@@ -213,11 +217,7 @@ class FileHashes:
         InvalidInput : a file is missing or cannot be read.
         """
         try:
-            stats = {name: path.stat() for name, path in files.items()}
-            marks = {
-                name: (str(files[name].resolve()), s.st_size, s.st_mtime_ns, s.st_ino)
-                for name, s in stats.items()
-            }
+            marks = {name: _mark(path) for name, path in files.items()}
             known = self._recall(list(marks.values()))
             digests = {}
             fresh = {}
@@ -235,7 +235,15 @@ class FileHashes:
         self._remember(fresh)
         return digests
 
-    def _recall(self, marks: list[tuple[str, int, int, int]]) -> dict[tuple[str, int, int, int], str]:
+    def knows(self, paths: Iterable[Path]) -> bool:
+        """Whether all these files were hashed before and are as they were."""
+        try:
+            marks = {_mark(path) for path in paths}
+        except OSError:
+            return False
+        return marks <= self._recall(list(marks)).keys()
+
+    def _recall(self, marks: list[Mark]) -> dict[Mark, str]:
         known = {}
         try:
             with _database(self._path) as database:
@@ -249,7 +257,7 @@ class FileHashes:
             pass
         return known
 
-    def _remember(self, fresh: Mapping[tuple[str, int, int, int], str]) -> None:
+    def _remember(self, fresh: Mapping[Mark, str]) -> None:
         if not fresh:
             return
         try:
@@ -258,6 +266,11 @@ class FileHashes:
                 database.executemany("insert or replace into files values (?, ?, ?, ?, ?)", rows)
         except sqlite3.Error:
             pass
+
+
+def _mark(path: Path) -> Mark:
+    found = path.stat()
+    return str(path.resolve()), found.st_size, found.st_mtime_ns, found.st_ino
 
 
 @contextmanager

@@ -25,6 +25,12 @@ class Order:
     spec: Json
     inputs: list[Input]
 
+    @property
+    def input_bytes(self) -> int:
+        """Size of what the task reads from the store."""
+        refs = [ref for entry in self.inputs for _, ref in entry.parts]
+        return sum(ref[2].size for ref in refs if not isinstance(ref, Source))
+
 
 class Identifier:
     """Makes orders; remembers code versions and the digests of source files for one run."""
@@ -90,6 +96,11 @@ class Identifier:
                     before = self._stamps.get((root, files.names), now)
                     changed.extend(str(root / name) for name in files.names if now[name] != before[name])
         return changed
+
+    def knows_sources(self) -> bool:
+        """Whether the store has seen all logs before; if not, there is work to do."""
+        sources = [files for session in self._flow.sessions.values() for files in session.sources.values()]
+        return self._store.hashes.knows(_root(files) / name for files in sources for name in files.names)
 
     def session_bytes(self, task: Task) -> int:
         """Size of the files that the task's session brings along; 0 for tasks of the whole map."""

@@ -6,6 +6,7 @@ import heapq
 import itertools
 import logging
 from collections import defaultdict
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -115,7 +116,7 @@ def run(
 
 
 class Driver:
-    """One run. Decides the order: deepest stage first, so that chunks flow through; then the biggest session."""
+    """One run. Decides the order: deepest stage first, so that chunks flow through; then the biggest session, and in it the biggest task."""
 
     def __init__(
         self, request: Request, store: Store, cluster: str, workers: int | None, progress: Progress
@@ -127,8 +128,8 @@ class Driver:
         self._progress = progress
         self._identifier = Identifier(self._flow, store)
         self._history = History(store)
-        self._executor: Executor | None = None
-        self._ready: list[tuple[tuple[int, int, Coordinate], int, Task, Order]] = []
+        self._starting: Future[Executor] | None = None
+        self._ready: list[tuple[tuple[int, int, int, Coordinate], int, Task, Order]] = []
         self._running: dict[str, tuple[Task, Order]] = {}
         self._twins: dict[str, list[Task]] = {}
         self._records: dict[Task, TaskRecord] = {}
@@ -153,6 +154,8 @@ class Driver:
         state = "failed"
         self._progress.begin([(node.name, node.title) for node in self._flow.nodes])
         try:
+            if not self._identifier.knows_sources():
+                self._start_executor()
             self._look_up()
             while self._ready or self._running:
                 self._submit()
@@ -163,8 +166,7 @@ class Driver:
             state = "interrupted"
             raise
         finally:
-            if self._executor is not None:
-                self._executor.close()
+            self._stop_executor()
             self._progress.end()
             record.finish(state, [(r.node, r.coordinate, r.key, r.verdict) for r in self.sorted_records()])
 
@@ -194,21 +196,33 @@ class Driver:
             return
         self._twins[order.key] = []
         self._reasons[order.key] = self._history.reason(task, order.identity)
-        rank = (-self._flow.depth[task.node.name], -self._identifier.session_bytes(task), task.coordinate)
+        sizes = (-self._identifier.session_bytes(task), -order.input_bytes)
+        rank = (-self._flow.depth[task.node.name], *sizes, task.coordinate)
         heapq.heappush(self._ready, (rank, next(self._serial), task, order))
 
-    def _submit(self) -> None:
-        if self._executor is None:
+    def _start_executor(self) -> Future[Executor]:
+        """On the side: a new log is hashed while the cluster starts."""
+        if self._starting is None:
             modules = sorted({node.stage.__module__ for node in self._flow.nodes})
-            self._executor = executor(self._cluster, self._workers, modules)
-        while self._ready and len(self._running) < self._executor.slots():
+            side = ThreadPoolExecutor(1, "start executor")
+            self._starting = side.submit(executor, self._cluster, self._workers, modules)
+            side.shutdown(wait=False)
+        return self._starting
+
+    def _stop_executor(self) -> None:
+        if self._starting is not None and self._starting.exception() is None:
+            self._starting.result().close()
+
+    def _submit(self) -> None:
+        at_work = self._start_executor().result()
+        while self._ready and len(self._running) < at_work.slots():
             *_, task, order = heapq.heappop(self._ready)
             self._running[order.key] = (task, order)
-            self._executor.submit(order.key, order.spec, dict(task.node.resources))
+            at_work.submit(order.key, order.spec, dict(task.node.resources))
         self._show()
 
     def _collect(self) -> None:
-        outcome = self._executor.next(POLL_S) if self._executor is not None else None
+        outcome = self._start_executor().result().next(POLL_S) if self._running else None
         if outcome is None:
             return
         key, answer = outcome

@@ -54,6 +54,11 @@ class StoredPart:
     files: tuple[StoredFile, ...]
     digest: str
 
+    @property
+    def size(self) -> int:
+        """Bytes of all its files."""
+        return sum(file.size for file in self.files)
+
     @classmethod
     def from_json(cls, body: Mapping[str, Any]) -> Self:
         files = tuple(StoredFile(**file) for file in body["files"])

@@ -5,16 +5,16 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from scanloom.stages.geometry.kernels import CACHE_FOLDER, remember_signatures
+from scanloom.stages.geometry.kernels import cache_folder, remember_signatures
 from scanloom.workflows.build_map import Order, build_map
 from scanloom.workflows.sessions import SAMPLE
 
-MARKER = CACHE_FOLDER / "warm"
+MARKER = "warm"
 
 
 def is_warm() -> bool:
     """Whether this version of the code was compiled on this machine."""
-    return MARKER.exists()
+    return (cache_folder() / MARKER).exists()
 
 
 def warm_kernels() -> None:
@@ -32,4 +32,4 @@ def warm_kernels() -> None:
     for _, error in outcome.failures:
         raise error
     remember_signatures()
-    MARKER.touch()
+    (cache_folder() / MARKER).touch()

@@ -2,23 +2,67 @@
 
 Numba notices a change of the file that holds a kernel, but not of a file it calls into. The cache folder is
 therefore named after the content of every module that holds kernels. Other modules say `from ... import kernel`.
+
+Numba itself is imported with the first call of a kernel: a command that only plans and waits never needs it.
 """
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
-
-import numba
+from typing import Any, TypeVar, cast
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def _cache_folder() -> Path:
+class Kernel:
+    """A function that is compiled, or loaded from the cache, when it is first called; kernels may call each other."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
+        functools.update_wrapper(self, function)
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.compiled(*arguments)
+
+    @functools.cached_property
+    def compiled(self) -> Any:
+        """Numba's dispatcher: no GIL, no fast-math (same bytes on every machine of one kind), cached on disk."""
+        options = {"cache": True, "nogil": True, "fastmath": False, "error_model": "numpy"}
+        return _numba().njit(**options)(self.function)
+
+    @property
+    def name(self) -> str:
+        return f"{self.function.__module__}:{self.function.__qualname__}"
+
+
+_KERNELS: list[Kernel] = []
+
+
+def kernel(function: F) -> F:
+    """Compile a function, from its first call on."""
+    _KERNELS.append(Kernel(function))
+    return cast("F", _KERNELS[-1])
+
+
+@functools.cache
+def _numba() -> Any:
+    """Numba with our cache folder; to its type inference a kernel is the dispatcher behind it."""
+    import numba
+    from numba.core import types
+    from numba.extending import typeof_impl
+
+    numba.config.CACHE_DIR = str(cache_folder())
+    typeof_impl.register(Kernel)(lambda value, context: types.Dispatcher(value.compiled))
+    return numba
+
+
+@functools.cache
+def cache_folder() -> Path:
     """`$SCANLOOM_CACHE`, else the user's cache folder, then a name that changes with the code."""
     stages = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
@@ -30,39 +74,27 @@ def _cache_folder() -> Path:
     return Path(base) / f"kernels-{digest.hexdigest()[:16]}"
 
 
-CACHE_FOLDER = _cache_folder()
-numba.config.CACHE_DIR = str(CACHE_FOLDER)
-SIGNATURES = CACHE_FOLDER / "signatures.pickle"
-
-_KERNELS: list[Any] = []
-
-
-def kernel(function: F) -> F:
-    """Compile with numba: no GIL, no fast-math (same bytes on every machine of one kind), cached on disk."""
-    compiled: F = numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")(function)
-    _KERNELS.append(compiled)
-    return compiled
+def _signatures_file() -> Path:
+    return cache_folder() / "signatures.pickle"
 
 
 def remember_signatures() -> None:
     """Note for which argument types each kernel was compiled so far, for `load_kernels` of other processes."""
-    known = {_name(k): k.signatures for k in _KERNELS if k.signatures}
-    CACHE_FOLDER.mkdir(parents=True, exist_ok=True)
-    part = SIGNATURES.with_suffix(f".{os.getpid()}")
+    used = [each for each in _KERNELS if "compiled" in vars(each)]
+    known = {each.name: each.compiled.signatures for each in used if each.compiled.signatures}
+    cache_folder().mkdir(parents=True, exist_ok=True)
+    part = _signatures_file().with_suffix(f".{os.getpid()}")
     part.write_bytes(pickle.dumps(known))
-    part.replace(SIGNATURES)
+    part.replace(_signatures_file())
 
 
 def load_kernels() -> None:
     """Load compiled kernels from the cache ahead of their first call: together they take more than a second."""
+    _numba()
     try:
-        known = pickle.loads(SIGNATURES.read_bytes())
+        known = pickle.loads(_signatures_file().read_bytes())
     except (OSError, pickle.UnpicklingError, EOFError, AttributeError, ImportError):
         return
     for each in list(_KERNELS):
-        for signature in known.get(_name(each), ()):
-            each.compile(signature)
-
-
-def _name(dispatcher: Any) -> str:
-    return f"{dispatcher.py_func.__module__}:{dispatcher.py_func.__qualname__}"
+        for signature in known.get(each.name, ()):
+            each.compiled.compile(signature)
