@@ -69,7 +69,8 @@ def _sample(
     velocities: F8,
 ) -> None:  # fmt: skip
     """Angular rate and velocity (n, 3) of the base origin in the base frame; beyond the samples the ends are held."""
-    g = w = 0
+    g: Int = 0
+    w: Int = 0
     if len(gyro_ns) > 0:
         g = max(np.searchsorted(gyro_ns, node_ns[0], side="right") - 1, 0)
     if len(wheel_ns) > 0:
