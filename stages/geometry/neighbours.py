@@ -28,7 +28,7 @@ SOURCE_SPACING_M = 1.0
 TARGET_POINTS = 40_000
 SOURCE_POINTS = 1000
 COARSE_SCALE_M, COARSE_STEPS = 0.5, 15
-FINE_SCALE_M, FINE_STEPS = 0.15, 4
+FINE_SCALE_M, FINE_STEPS = 0.15, 2
 MOST_PASSES = 4
 SETTLED_M_S = 1.0  # a guess wrong by this leaves an error of about 2 % of it
 SETTLED_RAD_S = 0.1
@@ -114,8 +114,14 @@ def _register(
     target.insert(_compensated(a.dense, a.reference_ns, track, twist))
     return align(
         target, _compensated(b.sparse, b.reference_ns, track, twist), track.relative(a.reference_ns, b.reference_ns, twist),
-        max_distance_m=voxel_m, scale_m=scale_m, max_iterations=iterations,
+        max_distance_m=voxel_m, scale_m=scale_m, max_iterations=iterations, free=_unknown(a, b, track),
     )  # fmt: skip
+
+
+def _unknown(a: ThinScan, b: ThinScan, track: MotionTrack) -> F8:
+    """Directions of the tangent (6, k) that the sensors do not tell between two scans."""
+    cover = track.covers(a.reference_ns, b.reference_ns)
+    return np.eye(6)[:, 3:] if cover.rotation else np.eye(6)
 
 
 def _compensated(points: Points, reference_ns: int, track: MotionTrack, twist: F8) -> F8:
