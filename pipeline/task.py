@@ -41,8 +41,24 @@ LARGE_MB = 450.0
 """A worker that grew beyond this gives memory back after the task; below, keeping it saves the next task time."""
 
 
+_under_way: set[str] = set()
+
+
+def at_work() -> bool:
+    """Whether this process carries out a task now."""
+    return bool(_under_way)
+
+
 def execute(spec: Json) -> Json:
     """Run one task; JSON in, JSON out. A failure is part of the answer, so that it survives the way back."""
+    _under_way.add(spec["key"])
+    try:
+        return _answer(spec)
+    finally:
+        _under_way.discard(spec["key"])
+
+
+def _answer(spec: Json) -> Json:
     limit_threads()
     started = time.perf_counter()
     with PeakMemory() as memory:
