@@ -1,0 +1,1 @@
+"""Speed and accuracy against peers; run by hand and at night, never in `make test`."""

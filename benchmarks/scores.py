@@ -1,0 +1,94 @@
+"""What is said of a system on a recording, against truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from benchmarks.systems import Outcome
+from scanloom.schemas.trajectory import Truth
+from scanloom.stages.geometry import alignment
+from scanloom.stages.geometry.interpolation import inside, interpolate_poses
+from scanloom.stages.geometry.se3 import F8, inverse, se3_log
+
+RPE_LENGTHS_M = (1, 5, 10, 20)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure, as `--json` writes it."""
+
+    name: str
+    value: float
+    unit: str
+    scope: str
+    method: str
+
+    def row(self) -> dict[str, object]:
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Score:
+    """One figure of one system on one recording, without its place in the name."""
+
+    name: str
+    value: float
+    unit: str
+    method: str
+
+
+def true_poses(truth: Truth, outcome: Outcome) -> tuple[F8, F8]:
+    """True poses at the system's own stamps, and the system's, (m, 4, 4) each, where truth has them."""
+    covered = inside(truth.stamp_ns, outcome.stamp_ns)
+    true = interpolate_poses(truth.stamp_ns, truth.T_truth_lidar, outcome.stamp_ns[covered])
+    return true, outcome.T[covered]
+
+
+def accuracy(truth: Truth, outcome: Outcome, frames: int) -> Iterator[Score]:
+    """RPE, KITTI's drift where the path is long enough, ATE."""
+    true, estimate = true_poses(truth, outcome)
+    yield Score("lost_scans", frames - len(outcome.T), "", "scans after the system lost track")
+    if len(outcome.T) < frames:
+        return
+    for length in RPE_LENGTHS_M:
+        errors = alignment.relative_errors(true, estimate, float(length))
+        if len(errors):
+            how = f"rms error of the motion over {length} m of path, {len(errors)} segments"
+            yield Score(f"rpe{length}_m", alignment.rms(errors.translation_m), "m", how)
+            yield Score(f"rpe{length}_deg", alignment.rms(np.degrees(errors.rotation_rad)), "deg", how)
+    kitti = alignment.kitti_errors(true, estimate)
+    if kitti:
+        how = f"KITTI odometry benchmark, {kitti.segments} segments of 100 m and more"
+        yield Score("kitti_t_rel_percent", kitti.t_rel_percent, "%", how)
+        yield Score("kitti_r_rel_deg_per_100m", kitti.r_rel_deg_per_100m, "deg/100m", how)
+    yield Score(
+        "ate_m", alignment.rms(alignment.absolute_errors(true, estimate)), "m", "rms after rigid alignment"
+    )
+
+
+def cost(outcome: Outcome) -> Iterator[Score]:
+    """Time per frame, peak memory, threads."""
+    how = f"without reading, {outcome.threads} thread{'s' if outcome.threads > 1 else ''}"
+    yield Score("ms_per_frame", float(np.median(outcome.ms)), "ms", f"median, {how}")
+    yield Score("ms_per_frame_p95", float(np.percentile(outcome.ms, 95)), "ms", f"95th percentile, {how}")
+    yield Score("ms_per_frame_mean", float(outcome.ms.mean()), "ms", f"mean, {how}")
+    yield Score("threads", outcome.threads, "", "threads that compute")
+    if np.isfinite(outcome.peak_mb):
+        yield Score(
+            "peak_rss_mb", outcome.peak_mb, "MB", "of the process, interpreter and libraries included"
+        )
+
+
+def nees(truth: Truth, outcome: Outcome) -> F8:
+    """(m,) xi^T C^-1 xi of the motions between consecutive scans; of a calibrated covariance the mean is 6."""
+    covered = inside(truth.stamp_ns, outcome.stamp_ns)
+    true, estimate = true_poses(truth, outcome)
+    both = covered[1:] & covered[:-1]
+    wanted = inverse(true[:-1]) @ true[1:]
+    found = inverse(estimate[:-1]) @ estimate[1:]
+    xi = se3_log(inverse(wanted) @ found)
+    C = outcome.extra["covariance"][1:][both]
+    return np.einsum("ni,ni->n", xi, np.linalg.solve(C, xi[:, :, None])[:, :, 0])

@@ -1,0 +1,134 @@
+"""The drives that systems are compared on: simulated here, or read from folders; made once, kept in a store.
+
+Raw scans, deskewed scans, labels, sensors and truth come from the stages of the workflow, through the engine: what was
+made with the same settings and code is taken from the store.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from scanloom.pipeline.request import Request, SessionInput
+from scanloom.pipeline.run import Result, run
+from scanloom.pipeline.store import Store
+from scanloom.schemas.product import Parts, Product
+from scanloom.schemas.scans import Deskewed, Labels, Scans
+from scanloom.schemas.session import RawLog, Session, TruthLog
+from scanloom.schemas.tracks import Imu, Wheel
+from scanloom.schemas.trajectory import Truth
+from scanloom.stages.logs.locate import locate
+from scanloom.workflows.map_session import NODES, SIMULATED
+
+STAGES = ("simulate", "truth", "ingest", "deskew", "denoise")
+PRODUCTS: tuple[type[Product], ...] = (Scans, Deskewed, Labels, Session, Imu, Wheel, Truth)
+
+ProductT = TypeVar("ProductT", bound=Product)
+Settings = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What to make: settings of the simulator, or a folder with a log."""
+
+    name: str
+    title: str
+    simulate: Settings | None = None
+    folder: Path | None = None
+    stretch_m: tuple[float, float] | None = None
+    """Of the lap, by arc length: where the drive is what its name says. All of it unless given."""
+
+
+_TOWN = {"start_m": 150.0, "duration_s": 36.0}
+
+SIMULATED_DRIVES = (
+    Drive("town_32", "town, 32 beams", {**_TOWN, "beams": 32}),
+    Drive("town_16", "town, 16 beams", {**_TOWN, "beams": 16}),
+    Drive("town_64", "town, 64 beams", {**_TOWN, "beams": 64}),
+    Drive("tunnel", "street, tunnel, field; 32 beams", {"start_m": 440.0, "duration_s": 26.0}),
+    Drive("field", "open field, 32 beams", {"start_m": 610.0, "duration_s": 26.0}),
+)
+KITTI = "kitti_raw_0005"
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Where the products of one drive lie."""
+
+    name: str
+    title: str
+    simulated: bool
+    files: Mapping[str, Sequence[str]]
+    digest: str
+    """Of the raw scans and truth: results of systems that read nothing else are kept under it."""
+    settings: Settings = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Number of scans."""
+        return sum(len(part.index) for part in self.parts(Scans))
+
+    def parts(self, product: type[ProductT]) -> Parts[ProductT]:
+        """All chunks of a product, opened when asked for."""
+        coordinates = (
+            (("session", self.name), ("chunk", f"{k:04d}")) for k in range(len(self.files[product.NAME]))
+        )
+        paths = (Path(path) for path in self.files[product.NAME])
+        return Parts(list(zip(coordinates, paths)), load=product.open)
+
+    def one(self, product: type[ProductT]) -> ProductT:
+        """A product that is not split."""
+        (path,) = self.files[product.NAME]
+        return product.open(Path(path))
+
+
+def drives(folders: Sequence[Path], names: Sequence[str] = ()) -> list[Drive]:
+    """The simulated drives and the folders, those called `names` if any are named."""
+    found = [*SIMULATED_DRIVES]
+    for folder in folders:
+        name = re.sub(r"[^A-Za-z0-9_]+", "_", folder.resolve().name).strip("_")
+        found.append(Drive(name, str(folder.name), folder=folder))
+    unknown = set(names) - {drive.name for drive in found}
+    if unknown:
+        known = ", ".join(drive.name for drive in found)
+        raise SystemExit(f"no sequence {', '.join(sorted(unknown))}; there are {known}")
+    return [drive for drive in found if not names or drive.name in names]
+
+
+def make(chosen: Sequence[Drive], store: Path, *, cluster: str = "local") -> list[Recording]:
+    """Run what is missing of simulation, ingest, deskew and denoise; the recordings, in the order of the drives."""
+    nodes = tuple(n for n in NODES if n.name in STAGES)
+    request = Request(nodes=nodes, sessions=tuple(_session(drive) for drive in chosen))
+    result = run(request, Store(store), cluster=cluster if len(chosen) > 1 else "none")
+    for task in result.failures:
+        if task.error is not None:
+            raise task.error
+    return [_sequence(drive, result) for drive in chosen]
+
+
+def _session(drive: Drive) -> SessionInput:
+    if drive.folder is None:
+        return SessionInput(drive.name, {}, {"simulate": dict(drive.simulate or {})}, frozenset({SIMULATED}))
+    log = locate(drive.folder)
+    return SessionInput(drive.name, {RawLog: log.raw_log, TruthLog: log.truth_log}, log.settings)
+
+
+def _sequence(drive: Drive, result: Result) -> Recording:
+    files = {
+        product.NAME: [
+            str(path) for where, path in result.files(product) if dict(where)["session"] == drive.name
+        ]
+        for product in PRODUCTS
+    }
+    digests = sorted(
+        part.digest
+        for where, artifact in result.artifacts
+        if dict(where).get("session") == drive.name
+        for product in (Scans, Truth)
+        for part in artifact.of(product)
+    )
+    digest = hashlib.sha256("".join(digests).encode()).hexdigest()[:16]
+    return Recording(drive.name, drive.title, drive.folder is None, files, digest, drive.simulate or {})

@@ -1,0 +1,256 @@
+"""The systems that are compared, each run in a process of its own: `python -m benchmarks.systems ORDER.json`.
+
+A process runs one system once over one recording and writes `OUT.npz`: poses with the stamps they hold for, time per frame,
+peak memory, threads. All systems get the same frames. Reading files is never part of the time.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.sequences import Recording
+from scanloom.schemas.product import Parts
+from scanloom.schemas.scans import Deskewed, Labels, Scan, Scans
+from scanloom.schemas.session import Session
+from scanloom.schemas.tracks import Imu, Wheel
+from scanloom.stages.geometry.se3 import F8, inverse, se3_log
+
+MAX_RANGE_M = 100.0
+LOST_SHARE = 0.2
+"""VGICP with fewer inliers has lost its map; what it says from there on is not looked at."""
+WARM_UP = 8
+"""Scans of a first run whose time does not count: compiled code is loaded, caches fill."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a system says of a recording."""
+
+    stamp_ns: NDArray[np.int64]
+    """(n,) times the poses hold for; not the same instant of the sweep for every system."""
+    T: F8
+    """(n, 4, 4) poses of the LiDAR in the system's own frame."""
+    ms: F8
+    """(n,) time per frame."""
+    peak_mb: float
+    threads: int
+    extra: dict[str, Any] = field(default_factory=dict)
+    """More of our own system: arrays (n, ...) and figures."""
+
+    def write(self, path: Path) -> None:
+        fixed = {"stamp_ns": self.stamp_ns, "T": self.T, "ms": self.ms}
+        np.savez(path, peak_mb=self.peak_mb, threads=self.threads, **fixed, **self.extra)
+
+    @classmethod
+    def read(cls, path: Path) -> Outcome:
+        with np.load(path) as file:
+            body = {name: file[name] for name in file.files}
+        known = {name: body.pop(name) for name in ("stamp_ns", "T", "ms")}
+        return cls(**known, peak_mb=float(body.pop("peak_mb")), threads=int(body.pop("threads")), extra=body)
+
+
+def run(system: str, recording: Recording, options: dict[str, Any]) -> Outcome:
+    """One system, once over one recording, in this process."""
+    return {"scanloom": _scanloom, "kiss_icp": _kiss_icp, "small_gicp": _small_gicp}[system](
+        recording, **options
+    )
+
+
+def version(system: str) -> str:
+    """Version of a peer; empty when it is not installed."""
+    try:
+        return metadata.version(
+            {"kiss_icp": "kiss-icp", "small_gicp": "small_gicp", "scanloom": "scanloom"}[system]
+        )
+    except metadata.PackageNotFoundError:
+        return ""
+
+
+# Ours ----------------------------------------------------------------------------------------------------------------
+
+
+def _scanloom(recording: Recording, timed: bool = True, settings: dict[str, Any] | None = None) -> Outcome:
+    """Deskew and odometry. Times are taken with the scans in memory and everything on one core; memory without."""
+    from scanloom.stages.odometry import Settings, odometry
+
+    session, imu, wheel = (recording.one(kind) for kind in (Session, Imu, Wheel))
+    chosen = Settings(**(settings or {}))
+    deskewed, labels = recording.parts(Deskewed), recording.parts(Labels)
+    if not timed:
+        track = odometry(chosen, deskewed, labels, session, imu, wheel)
+        return Outcome(
+            track.stamp_ns, track.T_odom_lidar, np.zeros(len(track)), _peak_mb(), threading.active_count()
+        )
+    on_one_core()
+    scans, classes = [*_flat(deskewed)], [*_flat(labels)]
+    first = _as_parts(scans[:WARM_UP]), _as_parts(classes[:WARM_UP])
+    odometry(chosen, *first, session, imu, wheel)
+    clock = Clock()
+    track = odometry(chosen, _as_parts(scans, clock), _as_parts(classes), session, imu, wheel)
+    ms = clock.per_frame(len(track))
+    deskew_ms = _deskew_ms(recording, session, imu, wheel)
+    extra = {
+        "covariance": track.covariance, "direction_p": track.direction_p, "weak_directions": track.weak_directions,
+        "degeneracy_d": track.degeneracy_d, "degeneracy_e": track.degeneracy_e, "reliable": track.reliable,
+        "deskew_ms": deskew_ms,
+    }  # fmt: skip
+    return Outcome(track.stamp_ns, track.T_odom_lidar, ms, float("nan"), 1, extra)
+
+
+class Clock:
+    """When each frame was asked for; the last entry is the end."""
+
+    def __init__(self) -> None:
+        self.ticks: list[float] = []
+        self.started = time.perf_counter()
+
+    def per_frame(self, frames: int) -> F8:
+        """(frames,) ms: between two requests, scaled so that they sum up to the whole time."""
+        whole = 1e3 * (time.perf_counter() - self.started)
+        between = 1e3 * np.diff(self.ticks)
+        if len(between) != frames - 1 or between.sum() <= 0:
+            return np.full(frames, whole / frames)
+        between = np.append(between, np.median(between))
+        ms: F8 = between * whole / between.sum()
+        return ms
+
+
+def _flat(parts: Any) -> Iterator[Any]:
+    return (item for part in parts for item in part)
+
+
+def _as_parts(items: list[Any], clock: Clock | None = None) -> Parts[Any]:
+    """All items as the one chunk of a session; `clock` notes when each is taken."""
+
+    def noting() -> Iterator[Any]:
+        for item in items:
+            if clock:
+                clock.ticks.append(time.perf_counter())
+            yield item
+
+    kind = Labels if hasattr(items[0], "class_") else Deskewed
+    return Parts([((("session", "a"), ("chunk", "0000")), kind(noting()))])
+
+
+def _deskew_ms(recording: Recording, session: Session, imu: Imu, wheel: Wheel) -> F8:
+    """(n,) ms of deskewing each scan, scans in memory, on one core."""
+    from scanloom.stages.deskew import Settings, deskew
+
+    ms: list[float] = []
+    for part in recording.parts(Scans):
+        scans = [*part]
+        for _ in zip(range(2), deskew(Settings(), Scans(scans), session, imu, wheel)):
+            pass  # compiled code is loaded
+        started = time.perf_counter()
+        for _ in deskew(Settings(), Scans(scans), session, imu, wheel):
+            now = time.perf_counter()
+            ms.append(1e3 * (now - started))
+            started = now
+    return np.array(ms)
+
+
+def on_one_core() -> None:
+    """Whatever threads there are, they share one core from here on."""
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+
+
+# Peers ---------------------------------------------------------------------------------------------------------------
+
+
+def _kiss_icp(recording: Recording, deskew: bool = True) -> Outcome:
+    """KISS-ICP as it comes, all threads. With its own deskewing its poses hold for the end of the sweep: it moves each
+    point by Exp((s - 1) * last motion), s from 0 to 1; without, for no instant in particular, the middle fits best."""
+    from kiss_icp.config import load_config
+    from kiss_icp.kiss_icp import KissICP
+
+    config = load_config(None)
+    config.data.max_range = MAX_RANGE_M
+    config.data.deskew = deskew
+    system = KissICP(config)
+    stamps, poses, ms = [], [], []
+    for scan in _flat(recording.parts(Scans)):
+        frame, share = scan.points().astype(np.float64), _share_of_sweep(scan)
+        started = time.perf_counter()
+        system.register_frame(frame, share)
+        ms.append(1e3 * (time.perf_counter() - started))
+        stamps.append(int(scan.stamp_ns.max()) if deskew else scan.reference_ns)
+        poses.append(system.last_pose.copy())
+    threads = len(os.sched_getaffinity(0))
+    return Outcome(np.array(stamps, np.int64), np.array(poses), np.array(ms), _peak_mb(), threads)
+
+
+def _share_of_sweep(scan: Scan) -> F8:
+    """(n,) 0 at the first point of the sweep, 1 at the last."""
+    first, last = int(scan.stamp_ns.min()), int(scan.stamp_ns.max())
+    share: F8 = (scan.stamp_ns - first) / max(last - first, 1)
+    return share
+
+
+def _small_gicp(recording: Recording, voxel_m: float = 1.0, scans: str = "own") -> Outcome:
+    """VGICP, scan to Gaussian voxel map, one thread, start from constant velocity.
+
+    scans : `own`, deskewed by the last motion as KISS-ICP does; `ours`, deskewed by our stage. Deskewing is not timed.
+    """
+    import small_gicp
+
+    from scanloom.stages.geometry.compensation import compensate
+    from scanloom.stages.geometry.motion import MotionTrack
+
+    still = MotionTrack.build(Imu.empty(), Wheel.empty(), recording.one(Session))
+    local_map = small_gicp.GaussianVoxelMap(voxel_m)
+    T, motion, last_ns = np.eye(4), np.eye(4), 0
+    stamps, poses, ms = [], [], []
+    for scan in _flat(recording.parts(Scans if scans == "own" else Deskewed)):
+        points = scan.points()
+        if scans == "own" and poses:
+            twist = se3_log(motion) / (1e-9 * (scan.reference_ns - last_ns))
+            moved = compensate(scan.stamp_ns, scan.x_m, scan.y_m, scan.z_m, scan.reference_ns, still, twist)
+            points = np.column_stack(moved)
+        points = points[np.linalg.norm(points, axis=1) < MAX_RANGE_M].astype(np.float64)
+        started = time.perf_counter()
+        cloud, _ = small_gicp.preprocess_points(
+            points, downsampling_resolution=0.25, num_neighbors=10, num_threads=1
+        )
+        if poses:
+            found = small_gicp.align(local_map, cloud, T @ motion, num_threads=1)
+            if found.num_inliers < LOST_SHARE * cloud.size():
+                break
+            now = np.array(found.T_target_source)
+            T, motion = now, inverse(T) @ now
+        local_map.insert(cloud, T)
+        ms.append(1e3 * (time.perf_counter() - started))
+        last_ns = scan.reference_ns
+        stamps.append(scan.reference_ns)
+        poses.append(T.copy())
+    return Outcome(np.array(stamps, np.int64), np.array(poses), np.array(ms), _peak_mb(), 1)
+
+
+def _peak_mb() -> float:
+    """Largest resident memory of this process; unlike `getrusage` it knows nothing of the parent's."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmHWM:"):
+            return float(line.split()[1]) / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def main() -> None:
+    order = json.loads(Path(sys.argv[1]).read_text())
+    recording = Recording(**order["recording"])
+    run(order["system"], recording, order["options"]).write(Path(order["out"]))
+
+
+if __name__ == "__main__":
+    main()
