@@ -18,6 +18,8 @@ MIN_INLIERS = 30
 MIN_INLIERS_OF_MATCHES = 0.4
 FADING = 0.9
 MAX_BRIDGED = 10
+DROP_SHARE = 0.1
+"""Of the local map's radius: after this way what is too far is dropped. Each time the whole map is copied."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,7 @@ class Tracker:
         self.inlier_ratio = 0.0
         self.keyframe_T, self.keyframe_ns = np.eye(4), 0
         self.inserted_T = np.eye(4)
+        self.dropped_m = np.zeros(3)
 
     def step(self, scan: ThinScan) -> Row:
         """Take the next scan."""
@@ -169,8 +172,10 @@ class Tracker:
         ):
             return
         self.map.insert(transform(self.T, fine))
-        self.map.drop_far(self.T[:3, 3], self.settings.map_radius_m)
         self.inserted_T = self.T
+        if np.linalg.norm(self.T[:3, 3] - self.dropped_m) > DROP_SHARE * self.settings.map_radius_m:
+            self.map.drop_far(self.T[:3, 3], self.settings.map_radius_m)
+            self.dropped_m = self.T[:3, 3]
 
     def _is_keyframe(self, stamp_ns: int) -> bool:
         late = stamp_ns - self.keyframe_ns >= self.settings.keyframe_s * 1e9
