@@ -1,7 +1,7 @@
 """Imported by the process that local workers fork from, and by nothing else: workers start with what they will need.
 
-Compiled kernels take about a second to load: one process does it for all workers, before it is asked for them.
-Libraries that only late stages use are imported by each worker while it waits for work.
+What every task needs is loaded once for all workers. The rest is loaded by each worker while it waits for work:
+compiled kernels, and libraries that only late stages use.
 """
 
 from __future__ import annotations
@@ -20,17 +20,26 @@ LATER = ("scipy.special", "gtsam", "scipy.spatial", "scipy.ndimage", "pyproj")
 PAUSE_S = 0.02
 
 
-def import_while_idle() -> None:
-    """Import `LATER` between tasks, one at a time; a task that begins waits for one import at most."""
+_kernels = load_kernels()
+
+
+def load_while_idle() -> None:
+    """Between tasks, one thing at a time: a task that begins waits for one of them at most."""
+    for _ in _kernels:
+        _wait()
     for name in LATER:
-        while at_work():
-            time.sleep(PAUSE_S)
+        _wait()
         importlib.import_module(name)
 
 
+def _wait() -> None:
+    while at_work():
+        time.sleep(PAUSE_S)
+
+
 def _on_the_side() -> None:
-    threading.Thread(target=import_while_idle, name="imports", daemon=True).start()
+    threading.Thread(target=load_while_idle, name="loading", daemon=True).start()
 
 
-load_kernels()
+next(_kernels, None)
 os.register_at_fork(after_in_child=_on_the_side)

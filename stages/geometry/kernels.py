@@ -12,7 +12,7 @@ import functools
 import hashlib
 import os
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -88,8 +88,11 @@ def remember_signatures() -> None:
     part.replace(_signatures_file())
 
 
-def load_kernels() -> None:
-    """Load compiled kernels from the cache ahead of their first call: together they take more than a second."""
+def load_kernels() -> Iterator[None]:
+    """Load compiled kernels from the cache ahead of their first call, one a step; the first step sets numba up.
+
+    Half a second for numba, five milliseconds for each kernel.
+    """
     _numba()
     try:
         known = pickle.loads(_signatures_file().read_bytes())
@@ -98,3 +101,4 @@ def load_kernels() -> None:
     for each in list(_KERNELS):
         for signature in known.get(each.name, ()):
             each.compiled.compile(signature)
+            yield
