@@ -27,7 +27,7 @@ TARGET_SPACING_M = 0.3
 SOURCE_SPACING_M = 1.0
 TARGET_POINTS = 40_000
 SOURCE_POINTS = 1000
-COARSE_SCALE_M, COARSE_STEPS = 0.5, 15
+COARSE_SCALE_M, COARSE_STEPS = 0.5, 10
 FINE_SCALE_M, FINE_STEPS = 0.15, 2
 MOST_PASSES = 4
 SETTLED_M_S = 1.0  # a guess wrong by this leaves an error of about 2 % of it
@@ -71,6 +71,14 @@ class ThinScan:
         fewer = sparse[:: max(1, -(-len(sparse) // SOURCE_POINTS))]
         return cls(scan.reference_ns, some.take(dense), some.take(fewer))
 
+    def rough(self) -> ThinScan:
+        """Fewer points yet where there are many: enough for a first guess."""
+        if len(self.dense.x_m) <= DENSE_POINTS:
+            return self
+        return ThinScan(
+            self.reference_ns, self.dense.take(slice(None, None, 2)), self.sparse.take(slice(None, None, 3))
+        )
+
 
 def twist_between(a: ThinScan, b: ThinScan, track: MotionTrack, guess: F8 | None) -> F8 | None:
     """Twist (6,) of the LiDAR from scan a to scan b, (rad/s, m/s) in its own frame, or None when they do not fit.
@@ -80,7 +88,7 @@ def twist_between(a: ThinScan, b: ThinScan, track: MotionTrack, guess: F8 | None
     pause_s = (b.reference_ns - a.reference_ns) * 1e-9
     if not 0 < pause_s < LONGEST_PAUSE_S or min(len(a.sparse.x_m), len(b.sparse.x_m)) < 100:
         return None
-    twist = guess if guess is not None else _first_guess(a, b, track)
+    twist = guess if guess is not None else _first_guess(a.rough(), b.rough(), track)
     for _ in range(MOST_PASSES):
         found = _register(a, b, track, twist, FINE_SCALE_M, FINE_STEPS)
         if not _fits(found, len(b.sparse.x_m)):
