@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from scanloom.pipeline.cluster import InProcess
 from scanloom.pipeline.plan import Request, SessionInput
 from scanloom.pipeline.run import run
 from scanloom.schemas.errors import EXIT_INVALID_INPUT, InvalidInput, ScanloomError, StageError, UsageError
@@ -283,3 +285,24 @@ def test_code_that_differs_from_the_key_is_refused(tmp_path, store, monkeypatch)
     monkeypatch.setattr(task, "code_here", lambda names: dict.fromkeys(names, "other"))
     result = run(request(log(tmp_path, "a", A)), store, cluster="none")
     assert "this worker has another version" in str(result.failures[0].error)
+
+
+def test_of_equal_tasks_the_biggest_goes_first(tmp_path, store, monkeypatch):
+    """Tiles differ in size, and a big one at the end would leave the other workers idle."""
+    given: list[tuple[str, int]] = []
+    submit = InProcess.submit
+
+    def noting(self, key, spec, resources):
+        read = sum(p.stat().st_size for e in spec["reads"] for p in map(_path, e["parts"]) if p.is_file())
+        given.append((spec["identity"]["stage"], read))
+        submit(self, key, spec, resources)
+
+    monkeypatch.setattr(InProcess, "submit", noting)
+    run(request(log(tmp_path, "a", [*range(10), *range(20, 30), *range(20, 30)])), store, cluster="none")
+    sizes = [size for stage, size in given if stage == "paint"]
+    assert len(set(sizes)) > 1
+    assert sizes == sorted(sizes, reverse=True)
+
+
+def _path(part) -> Path:
+    return Path(part["path"])

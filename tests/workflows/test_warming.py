@@ -1,0 +1,55 @@
+"""What a command and its workers load, and when."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+
+from scanloom.stages.geometry import kernels
+from scanloom.stages.geometry.voxels import downsample
+
+
+def run_python(code: str) -> str:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def test_a_command_that_only_plans_and_waits_needs_no_numerics():
+    code = "import sys, scanloom.workflows.build_map; print(*{'numba', 'scipy', 'gtsam', 'distributed'} & {*sys.modules})"
+    assert run_python(code) == ""
+
+
+def test_workers_start_with_numba_and_find_the_kernels_compiled_before(tmp_path, monkeypatch):
+    downsample(np.zeros((3, 3), np.float32), 1.0)
+    monkeypatch.setattr(kernels, "cache_folder", lambda: tmp_path)
+    kernels.remember_signatures()
+    loaded = sum(1 for _ in kernels.load_kernels())
+    used = [each for each in kernels._KERNELS if "compiled" in vars(each)]
+    assert loaded == sum(len(each.compiled.signatures) for each in used) > 0
+
+
+def test_without_a_cache_nothing_is_loaded_and_nothing_breaks(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernels, "cache_folder", lambda: tmp_path / "none")
+    assert list(kernels.load_kernels()) == []
+    (tmp_path / "none").mkdir()
+    (tmp_path / "none" / "signatures.pickle").write_bytes(b"\x80")
+    assert list(kernels.load_kernels()) == []
+
+
+def test_kernels_load_between_tasks_only():
+    code = """
+import threading, time
+from scanloom.pipeline import task
+import scanloom.workflows.warm_workers as warm
+warm._kernels, warm.LATER = iter(range(3)), ("colorsys",)
+task._under_way.add("x")
+side = threading.Thread(target=warm.load_while_idle)
+side.start(); time.sleep(0.2)
+import sys
+busy = "colorsys" in sys.modules, next(warm._kernels, None)
+task._under_way.clear(); side.join(5)
+print(busy, "colorsys" in sys.modules)
+"""
+    assert run_python(code) == "(False, 1) True"
