@@ -26,7 +26,7 @@ from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import Deskewed, Labels, Scan, Scans
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
-from scanloom.stages.geometry.se3 import F8, inverse, se3_log
+from scanloom.stages.geometry.se3 import F8, inverse, pose, se3_log
 
 MAX_RANGE_M = 100.0
 LOST_SHARE = 0.2
@@ -228,7 +228,7 @@ def _small_gicp(recording: Recording, voxel_m: float = 1.0, scans: str = "own") 
             found = small_gicp.align(local_map, cloud, T @ motion, num_threads=1)
             if found.num_inliers < LOST_SHARE * cloud.size():
                 break
-            now = np.array(found.T_target_source)
+            now = _orthonormal(found.T_target_source)
             T, motion = now, inverse(T) @ now
         local_map.insert(cloud, T)
         ms.append(1e3 * (time.perf_counter() - started))
@@ -236,6 +236,13 @@ def _small_gicp(recording: Recording, voxel_m: float = 1.0, scans: str = "own") 
         stamps.append(scan.reference_ns)
         poses.append(T.copy())
     return Outcome(np.array(stamps, np.int64), np.array(poses), np.array(ms), _peak_mb(), 1)
+
+
+def _orthonormal(T: F8) -> F8:
+    """A copy whose rotation is one: what VGICP returns is off by rounding, and a start at constant velocity doubles
+    that with every scan."""
+    left, _, right = np.linalg.svd(T[:3, :3])
+    return pose(left @ right, T[:3, 3])
 
 
 def _peak_mb() -> float:
