@@ -299,7 +299,8 @@ class Driver:
         for task, _ in self._running.values():
             under_way[task.node.name] += 1
         for node in self._flow.nodes:
-            known = sum(len(group.tasks) for _, group in self._flow.groups(node))
+            tasks = [task for _, group in self._flow.groups(node) for task in group.tasks.values()]
+            known = sum(task.state != "skipped" for task in tasks)
             pending = sum(group.open for _, group in self._flow.groups(node))
             counts[node.name] = (known - pending, under_way[node.name], known)
         self._progress.update(counts)

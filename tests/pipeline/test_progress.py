@@ -25,6 +25,14 @@ def test_lines_say_each_stage_once_it_is_done(tmp_path, store, caplog):
     assert sum("survey" in line for line in lines) == 1
 
 
+def test_a_stage_that_was_skipped_is_not_said_to_be_done(tmp_path, store, caplog):
+    with caplog.at_level(logging.INFO, logger="scanloom.progress"):
+        run(request(log(tmp_path, "bad", range(5), "broken")), store, cluster="none", progress=Lines())
+    lines = [record.getMessage() for record in caplog.records]
+    assert any("read failed" in line for line in lines)
+    assert not any("smooth" in line or "survey" in line for line in lines)
+
+
 def test_bars_on_a_terminal(tmp_path, store):
     terminal = Terminal()
     progress = progress_for(terminal)
