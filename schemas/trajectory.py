@@ -49,6 +49,10 @@ class Odometry(Table):
     reliable: NDArray[np.bool_] = column(
         "?", "registration converged; false where motion was bridged by prediction"
     )
+    segment: NDArray[np.int32] = column(
+        "i4",
+        "number of the segment, from 0; nothing tells the motion from the last scan of one to the first of the next",
+    )
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from scanloom.stages.geometry.lookahead import ahead
 from scanloom.stages.odometry.prediction import Predictor
 from scanloom.stages.odometry.settings import Settings
 from scanloom.stages.odometry.thinning import ThinScan, thin
-from scanloom.stages.odometry.tracker import Row, Tracker
+from scanloom.stages.odometry.tracker import Tracker
 
 __all__ = ["VERSION", "Settings", "odometry"]
 
@@ -43,22 +43,22 @@ def odometry(
     """
     predictor = Predictor(session, imu, wheel)
     tracker = Tracker(settings, predictor, np.array(session.T_base("lidar")))
-    rows: list[Row] = []
+    rows = tracker.rows
     for scan in ahead(_thinned(settings, deskewed, labels, session.name)):
-        if rows and scan.stamp_ns <= rows[-1].stamp_ns:
+        if len(rows) and scan.stamp_ns <= rows.last_ns:
             raise StageError(
                 f"scan {scan.scan_index} is not later than the scan before it",
                 where=f"session {session.name}, stamp {scan.stamp_ns} ns",
                 next_step="look at the clock of the LiDAR with `scanloom inspect`",
             )
-        rows.append(tracker.step(scan))
+        tracker.step(scan)
     if len(rows) < 2:
         raise StageError(
             f"odometry needs at least two scans, and there are {len(rows)}",
             where=f"session {session.name}",
             next_step="give a longer log",
         )
-    return _table(rows)
+    return rows.table()
 
 
 def _thinned(
@@ -73,20 +73,3 @@ def _thinned(
                     next_step="run `scanloom verify`, then map again",
                 )
             yield thin(settings, scan, label)
-
-
-def _table(rows: list[Row]) -> Odometry:
-    return Odometry(
-        scan_index=np.array([r.scan_index for r in rows], np.int64),
-        stamp_ns=np.array([r.stamp_ns for r in rows], np.int64),
-        T_odom_lidar=np.array([r.T_odom_lidar for r in rows]),
-        covariance=np.array([r.covariance for r in rows]),
-        inlier_ratio=np.array([r.inlier_ratio for r in rows]),
-        rmse_m=np.array([r.rmse_m for r in rows]),
-        degeneracy_d=np.array([r.seen.d for r in rows]),
-        degeneracy_e=np.array([r.seen.e_m for r in rows]),
-        direction_p=np.array([r.seen.p for r in rows]),
-        weak_directions=np.array([r.seen.directions for r in rows]),
-        keyframe=np.array([r.keyframe for r in rows]),
-        reliable=np.array([r.reliable for r in rows]),
-    )

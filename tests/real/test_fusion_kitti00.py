@@ -46,6 +46,7 @@ def drive(shared_data: Path) -> tuple[Odometry, Gnss, np.ndarray]:
         degeneracy_d=np.ones(n), degeneracy_e=np.zeros(n), direction_p=np.ones((n, 6)),
         weak_directions=np.broadcast_to(np.eye(6), (n, 6, 6)).copy(),
         keyframe=np.concatenate(([True], np.diff(np.floor(moved / 2)) > 0)), reliable=np.ones(n, bool),
+        segment=np.zeros(n, np.int32),
     )  # fmt: skip
     fixes = np.loadtxt(folder / "gnss_enu_1hz.csv", delimiter=",", skiprows=1)
     time_s = fixes[:, 0] - fixes[0, 0] + TIME_OFFSET_S

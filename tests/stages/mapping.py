@@ -54,7 +54,7 @@ def odometry_of(T: F8, *, reliable: np.ndarray | None = None) -> Odometry:
         scan_index=np.arange(n), stamp_ns=stamps(n), T_odom_lidar=T, covariance=np.tile(np.eye(6) * 1e-4, (n, 1, 1)),
         inlier_ratio=one, rmse_m=one * 0.02, degeneracy_d=one, degeneracy_e=one * 0.01, direction_p=np.ones((n, 6)),
         weak_directions=np.tile(np.eye(6), (n, 1, 1)), keyframe=np.ones(n, bool),
-        reliable=np.ones(n, bool) if reliable is None else reliable,
+        reliable=np.ones(n, bool) if reliable is None else reliable, segment=np.zeros(n, np.int32),
     )  # fmt: skip
 
 

@@ -83,7 +83,7 @@ def odometry_of(
         scan_index=np.arange(n), stamp_ns=world.stamp_ns, T_odom_lidar=np.array(T), covariance=covariance,
         inlier_ratio=np.ones(n), rmse_m=np.full(n, 0.03), degeneracy_d=np.ones(n), degeneracy_e=np.full(n, 0.01),
         direction_p=np.ones((n, 6)), weak_directions=np.broadcast_to(np.eye(6), (n, 6, 6)).copy(), keyframe=keyframe,
-        reliable=np.ones(n, bool),
+        reliable=np.ones(n, bool), segment=np.zeros(n, np.int32),
     )  # fmt: skip
 
 

@@ -117,6 +117,7 @@ def odometry_of(
         covariance=np.broadcast_to(np.eye(6) * 1e-5, (n, 6, 6)).copy(), inlier_ratio=np.ones(n), rmse_m=np.full(n, 0.02),
         degeneracy_d=np.ones(n), degeneracy_e=np.full(n, 0.01), direction_p=np.ones((n, 6)),
         weak_directions=np.broadcast_to(np.eye(6), (n, 6, 6)).copy(), keyframe=np.ones(n, bool), reliable=np.ones(n, bool),
+        segment=np.zeros(n, np.int32),
     )  # fmt: skip
 
 

@@ -1,0 +1,75 @@
+"""Scans that fit nowhere in the map, kept aside: if they fit each other they become a segment of their own."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanloom.stages.geometry.registration import VoxelMap
+from scanloom.stages.geometry.se3 import F8, se3_exp, se3_log
+from scanloom.stages.odometry.prediction import Prediction
+
+ENOUGH_SCANS = 4
+UNKNOWN_RAD, UNKNOWN_M, UNKNOWN_M_S = 1.0, 5.0, 20.0
+SURE_TURN_RAD = 0.01
+
+
+@dataclass
+class Aside:
+    """A map of scans in succession, each registered to those before it. `first` is the row of the first."""
+
+    map: VoxelMap
+    first: int
+    covariance: F8
+    """Of the motion from the row before the first, (6, 6): nothing tells it."""
+    scans: int = 0
+
+    def insert(self, points: F8) -> None:
+        """One more scan, in the frame of the map."""
+        self.map.insert(points)
+        self.scans += 1
+
+    @property
+    def enough(self) -> bool:
+        return self.scans >= ENOUGH_SCANS
+
+
+def unknown_motion(prediction: Prediction, pause_s: float) -> F8:
+    """Covariance (6, 6) of a motion that neither sensors nor scans tell; a gyro's word on the turn is kept."""
+    covariance = np.diag([UNKNOWN_RAD**2] * 3 + [(UNKNOWN_M + UNKNOWN_M_S * pause_s) ** 2] * 3)
+    turn = prediction.covariance[:3, :3]
+    if turn.diagonal().max() < SURE_TURN_RAD**2:
+        covariance[:3, :3] = turn
+    return covariance
+
+
+@dataclass(frozen=True)
+class Unconfirmed:
+    """A scan that was found where nobody expected it: it enters the map when the next scan agrees.
+
+    `T` is its pose, `T_before` and `twist` (6,) the pose and the motion before it, `covariance` that of the motion it was
+    expected to make.
+    """
+
+    fine: F8
+    T_before: F8
+    before_ns: int
+    twist: F8
+    covariance: F8
+    T: F8
+
+    @classmethod
+    def of(cls, T_before: F8, fine: F8, before_ns: int, now_ns: int, prediction: Prediction) -> Unconfirmed:
+        """`now_ns` is the time of the scan. It is where it was expected until it is found: see `at`."""
+        twist = se3_log(prediction.steady) / (1e-9 * (now_ns - before_ns))
+        return cls(fine, T_before, before_ns, twist, prediction.covariance, T_before @ prediction.T_last_now)
+
+    def at(self, T: F8) -> Unconfirmed:
+        return dataclasses.replace(self, T=T)
+
+    def expected(self, now_ns: int) -> F8:
+        """Pose (4, 4) at a later time if this scan had never been."""
+        T: F8 = self.T_before @ se3_exp(self.twist * 1e-9 * (now_ns - self.before_ns))
+        return T
