@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -17,11 +17,12 @@ from scanloom.schemas.scans import Deskewed, DeskewedScan, Scan, Scans
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.stages.geometry.compensation import compensate
-from scanloom.stages.geometry.motion import MotionTrack
+from scanloom.stages.geometry.motion import MotionTrack, Twists
 from scanloom.stages.geometry.neighbours import ThinScan, twist_between
 from scanloom.stages.geometry.se3 import F8
 
 VERSION = 1
+REMEMBERED_NS = 500_000_000
 
 
 class Settings(BaseModel):
@@ -69,35 +70,53 @@ def _compensated(scans: Scans, track: MotionTrack, neighbours: _Neighbours | Non
         yield _renamed(dataclasses.replace(scan, x_m=x, y_m=y, z_m=z))
 
 
+class Pair(NamedTuple):
+    """Two neighbouring scans: the twist (6,) between them and the time in the middle."""
+
+    middle_ns: int
+    twist: F8
+
+
 class _Neighbours:
     """Twist of each scan from the pairs it forms with the scan before and the scan after, where sensors are silent."""
 
     def __init__(self, track: MotionTrack) -> None:
         self._track = track
         self._thin: ThinScan | None = None
-        self._before: F8 | None = None
-        self._last: F8 | None = None
+        self._before: Pair | None = None
+        self._last: Twists | None = None
 
-    def twist(self, scan: Scan, following: Scan | None) -> F8 | None:
-        """Mean twist of the two pairs, of one at the chunk's ends; the last one known when no pair fits."""
+    def twist(self, scan: Scan, following: Scan | None) -> Twists | None:
+        """Twists of the two pairs, of one at the chunk's ends; the last known for a while when no pair fits.
+
+        Each holds in the middle between its two scans: a motion that changes during the sweep is followed.
+        """
         if self._told(scan) and (following is None or self._told(following)):
             self._thin = self._before = None
-            return self._last
+            return self._recent(scan)
         before, after = self._before, self._pair(scan, following)
-        known = [twist for twist in (before, after) if twist is not None]
+        known = [pair for pair in (before, after) if pair is not None]
         if known:
-            self._last = np.mean(known, axis=0)
+            self._last = Twists(np.array([p.middle_ns for p in known]), np.array([p.twist for p in known]))
         self._before = after
+        return self._recent(scan)
+
+    def _recent(self, scan: Scan) -> Twists | None:
+        """The last twists that were found, unless they say nothing of this scan any more."""
+        if self._last is None or scan.reference_ns - int(self._last.stamp_ns[-1]) > REMEMBERED_NS:
+            return None
         return self._last
 
-    def _pair(self, scan: Scan, following: Scan | None) -> F8 | None:
+    def _pair(self, scan: Scan, following: Scan | None) -> Pair | None:
         if following is None:
             return None
         near = self._thin if self._thin is not None else ThinScan.of(scan)
         self._thin = ThinScan.of(following)
-        return twist_between(
-            near, self._thin, self._track, self._last if self._before is None else self._before
-        )
+        guess = self._before.twist if self._before is not None else None
+        if guess is None and self._last is not None:
+            guess = self._last.value[-1]
+        twist = twist_between(near, self._thin, self._track, guess)
+        return None if twist is None else Pair((near.reference_ns + self._thin.reference_ns) // 2, twist)
 
     def _told(self, scan: Scan) -> bool:
         if len(scan) == 0:

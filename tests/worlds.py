@@ -5,6 +5,7 @@ Smaller and simpler than the simulator's town, and independent of it, so that ne
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,6 +84,21 @@ def sweep(
     column = np.arange(len(rays)) // rows
     dt = (column / columns - 0.5) * period_s
     T = T_world_lidar @ se3_exp(dt[:, None] * twist)
+    ranges = world.ranges(T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], rays))
+    if rng is not None:
+        ranges = ranges + rng.normal(0, noise_m, len(ranges))
+    return _scan(rays, ranges, column, rows, columns, stamp_ns, index, Scan, period_s)
+
+
+def sweep_along(
+    world: BoxWorld, path: Callable[[F8], F8], middle_s: float, *, index: int = 0, stamp_ns: int = 0,
+    period_s: float = 0.1, rng: np.random.Generator | None = None, noise_m: float = 0.02, rows: int = 16,
+    columns: int = 512,
+) -> Scan:  # fmt: skip
+    """One sweep around the time `middle_s`, taken along a `path` that gives poses (n, 4, 4) at times (n,), s."""
+    rays = beams(rows, columns)
+    column = np.arange(len(rays)) // rows
+    T = np.repeat(path(middle_s + (np.arange(columns) / columns - 0.5) * period_s), rows, axis=0)
     ranges = world.ranges(T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], rays))
     if rng is not None:
         ranges = ranges + rng.normal(0, noise_m, len(ranges))

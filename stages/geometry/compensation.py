@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.stages.geometry.kernels import kernel
-from scanloom.stages.geometry.motion import MotionTrack
+from scanloom.stages.geometry.motion import MotionTrack, Twists
 from scanloom.stages.geometry.se3 import F8
 
 F4 = NDArray[np.float32]
@@ -19,7 +19,13 @@ LONGEST_SWEEP_NS = 500_000_000
 
 
 def compensate(
-    stamp_ns: I8, x_m: F4, y_m: F4, z_m: F4, reference_ns: int, track: MotionTrack, twist: F8 | None = None
+    stamp_ns: I8,
+    x_m: F4,
+    y_m: F4,
+    z_m: F4,
+    reference_ns: int,
+    track: MotionTrack,
+    twist: F8 | Twists | None = None,
 ) -> tuple[F4, F4, F4]:
     """Coordinates (n,) each, m, in the LiDAR frame at `reference_ns`: p' = T_reference_t p (methods 1.4).
 

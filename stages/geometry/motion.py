@@ -18,6 +18,7 @@ position, no side slip, lever arms through the extrinsics.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,8 @@ MAX_BIAS_RAD_S = 0.05
 LEAST_SAMPLES = 8
 MAX_MEAN_TILT_RAD = np.radians(45.0)
 NOTHING = np.zeros((0, 2), np.int64)
-NO_STAMPS = np.zeros(0, np.int64)
+NO_STAMPS, ANY_TIME = np.zeros(0, np.int64), np.zeros(1, np.int64)
+STANDING = (ANY_TIME, np.zeros((1, 3)), np.zeros((1, 3)))
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,20 @@ class Coverage:
 
     rotation: bool
     translation: bool
+
+
+class Twists(NamedTuple):
+    """Twists (k, 6) of the LiDAR at increasing times (k,): rotation rate and velocity in its own frame, rad/s, m/s."""
+
+    stamp_ns: I8
+    value: F8
+
+    @classmethod
+    def of(cls, twist: F8 | Twists) -> Twists:
+        """A single twist (6,) holds throughout."""
+        return (
+            twist if isinstance(twist, Twists) else cls(ANY_TIME, np.ascontiguousarray(twist).reshape(1, 6))
+        )
 
 
 @dataclass(frozen=True)
@@ -112,38 +128,43 @@ class MotionTrack:
             translation=_without_gap(self.wheel_ns, start, end, self.max_wheel_gap_ns),
         )
 
-    def relative(self, a_ns: int, b_ns: int, twist: F8 | None = None) -> F8:
+    def relative(self, a_ns: int, b_ns: int, twist: F8 | Twists | None = None) -> F8:
         """T_a_b (4, 4) of the LiDAR between two times; `twist` as for `poses`."""
         T_a_b: F8 = self.poses(np.array([b_ns]), a_ns, twist)[0]
         return T_a_b
 
-    def poses(self, at_ns: I8, reference_ns: int, twist: F8 | None = None) -> F8:
+    def poses(self, at_ns: I8, reference_ns: int, twist: F8 | Twists | None = None) -> F8:
         """T_reference_t (m, 4, 4) of the LiDAR at the times `at_ns` (m,), in any order.
 
-        twist : (6,) rotation rate and velocity of the LiDAR in its own frame (rad/s, m/s); stands in for what the
-            sensors do not cover between the first and the last time. No motion gives exact identities.
+        twist : (6,) rotation rate and velocity of the LiDAR in its own frame (rad/s, m/s), or several with their times;
+            stands in for what the sensors do not cover between the first and the last time.
+        No motion gives exact identities.
         """
         at_ns = np.asarray(at_ns, np.int64)
         if len(at_ns) == 0:
             return np.zeros((0, 4, 4))
         first, last = min(int(at_ns.min()), reference_ns), max(int(at_ns.max()), reference_ns)
         cover = self.covers(first, last)
-        rate, velocity, point = self._constant(cover, twist)
+        known = None if twist is None else Twists.of(twist)
         T_reference_lidar: F8 = travel(
             at_ns, reference_ns, first, last, self.gyro_ns if cover.rotation else NO_STAMPS, self.rate_base,
-            self.wheel_ns if cover.translation else NO_STAMPS, self.speed_m_s, rate, velocity, point, self.T_base_lidar,
+            self.wheel_ns if cover.translation else NO_STAMPS, self.speed_m_s, *self._steady(known),
+            self._point(cover, known), self.T_base_lidar,
         )  # fmt: skip
         return T_reference_lidar
 
-    def _constant(self, cover: Coverage, twist: F8 | None) -> tuple[F8, F8, F8]:
-        """Angular rate, velocity, and the point of the base that has it, for what the sensors do not tell."""
-        R, lever = self.T_base_lidar[:3, :3], self.T_base_lidar[:3, 3]
-        rate = np.zeros(3) if twist is None else R @ twist[:3]
+    def _steady(self, twists: Twists | None) -> tuple[I8, F8, F8]:
+        """Times, angular rates and velocities of the LiDAR in axes of the base that stand in for missing sensors."""
+        if twists is None:
+            return STANDING
+        R = self.T_base_lidar[:3, :3]
+        return twists.stamp_ns, twists.value[:, :3] @ R.T, twists.value[:, 3:] @ R.T
+
+    def _point(self, cover: Coverage, twists: Twists | None) -> F8:
+        """Point of the base whose velocity is known: of the wheels, or of the LiDAR; without either the origin stands."""
         if cover.translation:
-            return rate, np.zeros(3), self.wheel_position
-        if twist is None:
-            return rate, np.zeros(3), np.zeros(3)
-        return rate, R @ twist[3:], lever.copy()
+            return self.wheel_position
+        return np.zeros(3) if twists is None else self.T_base_lidar[:3, 3].copy()
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -88,26 +88,34 @@ def twist_between(a: ThinScan, b: ThinScan, track: MotionTrack, guess: F8 | None
     pause_s = (b.reference_ns - a.reference_ns) * 1e-9
     if not 0 < pause_s < LONGEST_PAUSE_S or min(len(a.sparse.x_m), len(b.sparse.x_m)) < 100:
         return None
-    twist = guess if guess is not None else _first_guess(a.rough(), b.rough(), track)
+    twist = None if guess is None else _settled_twist(a, b, track, guess)
+    if twist is None:
+        twist = _settled_twist(a, b, track, _first_guess(a.rough(), b.rough(), track, guess))
+    return twist
+
+
+def _settled_twist(a: ThinScan, b: ThinScan, track: MotionTrack, guess: F8) -> F8 | None:
+    """Registered until compensating with the result changes it no more; None when the scans do not fit then."""
+    pause_s = (b.reference_ns - a.reference_ns) * 1e-9
+    twist = guess
     for _ in range(MOST_PASSES):
         found = _register(a, b, track, twist, FINE_SCALE_M, FINE_STEPS)
-        if not _fits(found, len(b.sparse.x_m)):
-            return None
         before, twist = twist, se3_log(found.T_target_source) / pause_s
+        if not _plausible(twist):
+            return None
         if _settled(twist - before):
-            break
-    return twist if _plausible(twist) else None
+            return twist if _fits(found, len(b.sparse.x_m)) else None
+    return None
 
 
-def _first_guess(a: ThinScan, b: ThinScan, track: MotionTrack) -> F8:
-    """The best of several forward speeds, each refined by one coarse registration."""
+def _first_guess(a: ThinScan, b: ThinScan, track: MotionTrack, last: F8 | None) -> F8:
+    """The best of several forward speeds and of the twist before, each refined by one coarse registration."""
     forward = track.T_base_lidar[0, :3]  # x of the base in the LiDAR frame
     pause_s = (b.reference_ns - a.reference_ns) * 1e-9
+    starts = [np.concatenate((np.zeros(3), speed * forward)) for speed in FIRST_SPEEDS_M_S]
     best, best_twist = -1.0, np.zeros(6)
-    for speed in FIRST_SPEEDS_M_S:
-        found = _register(
-            a, b, track, np.concatenate((np.zeros(3), speed * forward)), COARSE_SCALE_M, COARSE_STEPS
-        )
+    for start in starts if last is None else [last, *starts]:
+        found = _register(a, b, track, start, COARSE_SCALE_M, COARSE_STEPS)
         fit = found.inlier_ratio / (1e-3 + np.nan_to_num(found.rmse_m, nan=1.0))
         if fit > best:
             best, best_twist = fit, se3_log(found.T_target_source) / pause_s

@@ -17,21 +17,28 @@ LONGEST_STEP_NS = 20_000_000
 @kernel
 def travel(
     at_ns: I8, reference_ns: Int, first_ns: Int, last_ns: Int, gyro_ns: I8, rate_base: F8, wheel_ns: I8, speed_m_s: F8,
-    rate: F8, velocity: F8, point: F8, T_base_lidar: F8,
+    steady_ns: I8, rate: F8, velocity: F8, point: F8, T_base_lidar: F8,
 ) -> F8:  # fmt: skip
     """T_reference_t (m, 4, 4) of the LiDAR at the times `at_ns` (m,), all within [first_ns, last_ns].
 
-    gyro_ns, rate_base : (n,), (n, 3) angular rate of the base, rad/s; where there is none, `rate` (3,) throughout.
-    wheel_ns, speed_m_s : (k,) speed along x of the base, m/s; where there is none, `velocity` (3,) throughout.
-    point : (3,) where in the base frame that speed or velocity is measured, m.
+    gyro_ns, rate_base : (n,), (n, 3) angular rate of the base, rad/s; empty stamps where there is none.
+    wheel_ns, speed_m_s : (k,) speed along x of the base, m/s; empty stamps where there is none.
+    steady_ns, rate, velocity : (j,), (j, 3), (j, 3), j > 0, in the base frame; they take the place of what is missing.
+    point : (3,) where in the base frame the speed or velocity is measured, m.
 
     R_{k+1} = R_k Exp(w dt), p_{k+1} = p_k + R_k Exp(w dt / 2) v dt with the mean w, v of the two ends (methods 1.4).
     Without motion every pose is the identity, exactly.
     """
     node_ns = _nodes(at_ns, reference_ns, first_ns, last_ns, gyro_ns, wheel_ns)
     n = len(node_ns)
-    rates, velocities = np.empty((n, 3)), np.empty((n, 3))
-    _sample(node_ns, gyro_ns, rate_base, rate, wheel_ns, speed_m_s, velocity, point, rates, velocities)
+    rates, velocities = np.zeros((n, 3)), np.zeros((n, 3))
+    has_gyro, has_wheel = len(gyro_ns) > 0, len(wheel_ns) > 0
+    _interpolate(gyro_ns if has_gyro else steady_ns, rate_base if has_gyro else rate, node_ns, rates)
+    if has_wheel:
+        _interpolate(wheel_ns, speed_m_s.reshape(-1, 1), node_ns, velocities)
+    else:
+        _interpolate(steady_ns, velocity, node_ns, velocities)
+    _to_origin(rates, point, velocities)
     R, p = np.zeros((n, 3, 3)), np.zeros((n, 3))
     R[0, 0, 0] = R[0, 1, 1] = R[0, 2, 2] = 1.0
     half = np.empty((3, 3))
@@ -64,33 +71,24 @@ def _nodes(at_ns: I8, reference_ns: Int, first_ns: Int, last_ns: Int, gyro_ns: I
 
 
 @kernel
-def _sample(
-    node_ns: I8, gyro_ns: I8, rate_base: F8, rate: F8, wheel_ns: I8, speed_m_s: F8, velocity: F8, point: F8, rates: F8,
-    velocities: F8,
-) -> None:  # fmt: skip
-    """Angular rate and velocity (n, 3) of the base origin in the base frame; beyond the samples the ends are held."""
-    g: Int = 0
-    w: Int = 0
-    if len(gyro_ns) > 0:
-        g = max(np.searchsorted(gyro_ns, node_ns[0], side="right") - 1, 0)
-    if len(wheel_ns) > 0:
-        w = max(np.searchsorted(wheel_ns, node_ns[0], side="right") - 1, 0)
-    for k in range(len(node_ns)):
-        if len(gyro_ns) > 0:
-            g, share = _place(gyro_ns, g, node_ns[k])
-            after = min(g + 1, len(gyro_ns) - 1)
-            for r in range(3):
-                rates[k, r] = rate_base[g, r] + share * (rate_base[after, r] - rate_base[g, r])
-        else:
-            rates[k, 0], rates[k, 1], rates[k, 2] = rate[0], rate[1], rate[2]
-        x, y, z = velocity[0], velocity[1], velocity[2]
-        if len(wheel_ns) > 0:
-            w, share = _place(wheel_ns, w, node_ns[k])
-            after = min(w + 1, len(wheel_ns) - 1)
-            x, y, z = speed_m_s[w] + share * (speed_m_s[after] - speed_m_s[w]), 0.0, 0.0
-        velocities[k, 0] = x - (rates[k, 1] * point[2] - rates[k, 2] * point[1])
-        velocities[k, 1] = y - (rates[k, 2] * point[0] - rates[k, 0] * point[2])
-        velocities[k, 2] = z - (rates[k, 0] * point[1] - rates[k, 1] * point[0])
+def _interpolate(stamp_ns: I8, value: F8, at_ns: I8, out: F8) -> None:
+    """Values (k, c) at increasing times (k,), linear between samples (n, c); beyond them the ends are held."""
+    i: Int = max(np.searchsorted(stamp_ns, at_ns[0], side="right") - 1, 0)
+    for k in range(len(at_ns)):
+        i, share = _place(stamp_ns, i, at_ns[k])
+        after = min(i + 1, len(stamp_ns) - 1)
+        for c in range(value.shape[1]):
+            out[k, c] = value[i, c] + share * (value[after, c] - value[i, c])
+
+
+@kernel
+def _to_origin(rates: F8, point: F8, velocities: F8) -> None:
+    """From the velocity of a point of the base to that of its origin: v - w x point, in place."""
+    for k in range(len(rates)):
+        x, y, z = rates[k, 0], rates[k, 1], rates[k, 2]
+        velocities[k, 0] -= y * point[2] - z * point[1]
+        velocities[k, 1] -= z * point[0] - x * point[2]
+        velocities[k, 2] -= x * point[1] - y * point[0]
 
 
 @kernel

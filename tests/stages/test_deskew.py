@@ -14,7 +14,7 @@ from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.stages.deskew import Settings, deskew
 from scanloom.stages.geometry.motion import MotionTrack
 from scanloom.stages.geometry.se3 import F8, adjoint, inverse, pose, se3_exp, so3_exp, transform
-from tests.worlds import BoxWorld, street, sweep
+from tests.worlds import BoxWorld, street, sweep, sweep_along
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 100_000_000
@@ -126,6 +126,30 @@ def test_without_sensors_neighbours_tell_the_motion(speed: float) -> None:
         before, after = rms(scan.points() - exact(scan, twist)), rms(flat.points() - exact(scan, twist))
         assert 1e-4 < after < 0.05
         assert after < 0.25 * before
+
+
+def test_a_turn_rate_that_changes_within_the_sweep_is_followed() -> None:
+    def path(at_s: F8) -> F8:
+        yaw = 0.25 * np.sin(2 * np.pi * 0.8 * at_s)  # up to 6 rad/s2, a hand that looks around
+        return pose(
+            so3_exp(yaw[:, None] * np.array([0, 0, 1.0])), np.column_stack((1.5 * at_s, 0 * at_s, 0 * at_s))
+        )
+
+    rng = np.random.default_rng(6)
+    middles = 0.1 * np.arange(10)
+    scans = [
+        sweep_along(street(5), path, t, index=i, stamp_ns=START_NS + i * PERIOD_NS, rng=rng, noise_m=0.01)
+        for i, t in enumerate(middles)
+    ]
+    left, distorted = [], []
+    for t, scan, flat in list(zip(middles, scans, run(scans, make_session())))[1:-1]:
+        at_s = t + 1e-9 * (scan.stamp_ns - scan.reference_ns)
+        T = inverse(path(np.array([t])))[0] @ path(at_s)
+        true = np.einsum("nij,nj->ni", T[:, :3, :3], scan.points().astype(float)) + T[:, :3, 3]
+        left.append(rms(flat.points() - true))
+        distorted.append(rms(scan.points() - true))
+    assert np.mean(distorted) > 0.3
+    assert 0.005 < np.mean(left) < 0.2 * np.mean(distorted)
 
 
 def test_gyro_alone_leaves_only_translation_to_the_neighbours() -> None:
