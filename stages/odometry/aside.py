@@ -58,16 +58,20 @@ class Unconfirmed:
     before_ns: int
     twist: F8
     covariance: F8
+    expectable: bool
+    """Whether anything told where to expect it."""
     T: F8
+    sure: bool
 
     @classmethod
     def of(cls, T_before: F8, fine: F8, before_ns: int, now_ns: int, prediction: Prediction) -> Unconfirmed:
-        """`now_ns` is the time of the scan. It is where it was expected until it is found: see `at`."""
+        """`now_ns` is the time of the scan. It is not found yet: see `found`."""
         twist = se3_log(prediction.steady) / (1e-9 * (now_ns - before_ns))
-        return cls(fine, T_before, before_ns, twist, prediction.covariance, T_before @ prediction.T_last_now)
+        return cls(fine, T_before, before_ns, twist, prediction.covariance, prediction.known, T_before, False)
 
-    def at(self, T: F8) -> Unconfirmed:
-        return dataclasses.replace(self, T=T)
+    def found(self, T: F8, *, sure: bool) -> Unconfirmed:
+        """The same at pose T (4, 4); `sure`: it fits so well there that it is not to be doubted any more."""
+        return dataclasses.replace(self, T=T, sure=sure)
 
     def expected(self, now_ns: int) -> F8:
         """Pose (4, 4) at a later time if this scan had never been."""

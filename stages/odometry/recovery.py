@@ -30,15 +30,21 @@ REACH_M, FASTEST_CHANGE_M_S2, MOST_REACH_M = 1.5, 6.0, 20.0
 RISE_M, SLOPE = 1.0, 0.1
 SURE_RAD, TURN_RAD, TUMBLE_RAD, TUMBLE_REACH_M = 0.05, 0.05, np.radians(63.0), 3.0
 APART_M, APART_RAD = 0.5, 0.05
+TURN_COST, WAY_COST = 0.15, 0.1
+"""Of two places that fit alike the nearer one is likelier: share of the fit that half a turn, and the farthest way, cost."""
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """A registration, whether a search and not the expected motion led to it, and whether it can be believed."""
+    """A registration, whether a search and not the expected motion led to it, and whether it can be believed.
+
+    sure : it fits as scans usually do, and much better than any other place.
+    """
 
     registration: Registration
     searched: bool
     believed: bool
+    sure: bool = True
 
 
 class Recovery:
@@ -84,24 +90,28 @@ class Recovery:
             if any(self.fit(r, n) >= LEAST_SURPRISING * self.usual for r in (*tries, *found)):
                 break
         near = [r for r in found if _distance(r.T_target_source, T_expected) <= reach_m + 1.0]
-        return self._choose(tries, near, n) if tries or near else None
+        if not tries and not near:
+            return None
+        return self._choose(
+            tries, near, lambda r: self.fit(r, n) * _likelihood(r.T_target_source, T_expected)
+        )
 
-    def _choose(self, tries: Sequence[Registration], found: Sequence[Registration], points: int) -> Attempt:
-        best = self._best([*tries, *found], points)
-        top = self.fit(best, points)
-        direct = self._best(tries, points) if tries else None
-        if direct is not None and (fit := self.fit(direct, points)) >= LEAST_AHEAD * top:
-            return Attempt(direct, searched=False, believed=fit >= LEAST_EXPECTED * self.usual)
-        rivals = [
-            self.fit(r, points) for r in (*tries, *found) if _apart(r.T_target_source, best.T_target_source)
-        ]
-        believed = max(rivals, default=0.0) < MOST_OF_BEST * top and top >= LEAST_SURPRISING * self.usual
-        if direct is not None and not believed and not self.usual:
-            return Attempt(direct, searched=False, believed=True)
-        return Attempt(best, searched=True, believed=believed)
+    def _choose(
+        self, tries: Sequence[Registration], found: Sequence[Registration], merit: Callable[[Registration], float]
+    ) -> Attempt:  # fmt: skip
+        """The best of all, believed when it stands alone and fits as scans usually do; one of `tries` is as good if nearly so.
 
-    def _best(self, registrations: Sequence[Registration], points: int) -> Registration:
-        return max(registrations, key=lambda r: self.fit(r, points))
+        Nothing is usual yet at the start of a map: then the best is taken at its word, and the next scan is to confirm it.
+        """
+        best = max([*tries, *found], key=merit)
+        top = merit(best)
+        direct = max(tries, key=merit) if tries else None
+        if direct is not None and merit(direct) >= LEAST_AHEAD * top:
+            return Attempt(direct, searched=False, believed=merit(direct) >= LEAST_EXPECTED * self.usual)
+        rivals = [merit(r) for r in (*tries, *found) if _apart(r.T_target_source, best.T_target_source)]
+        alone = max(rivals, default=0.0) < MOST_OF_BEST * top
+        believed = not self.usual or (alone and top >= LEAST_SURPRISING * self.usual)
+        return Attempt(best, searched=True, believed=believed, sure=alone and top >= DOUBTFUL * self.usual)
 
 
 def reach_of(prediction: Prediction) -> float:
@@ -118,6 +128,12 @@ def windows(prediction: Prediction, reach_m: float) -> list[Window]:
         return [Window(headings(TURN_RAD), reach_m, rise_m)]
     near = min(reach_m, TUMBLE_REACH_M)
     return [Window(headings(np.pi), reach_m, rise_m), Window(rotations(TUMBLE_RAD), near, near)]
+
+
+def _likelihood(T: F8, T_expected: F8) -> float:
+    turn = float(np.linalg.norm(so3_log((inverse(T_expected) @ T)[:3, :3])))
+    way = min(_distance(T, T_expected) / MOST_REACH_M, 1.0)
+    return 1.0 - TURN_COST * turn / np.pi - WAY_COST * way
 
 
 def _distance(a: F8, b: F8) -> float:

@@ -84,7 +84,7 @@ class Tracker:
         )
         if in_map:
             self.rows.settle(before.T_before @ prediction.T_last_now, prediction.covariance)
-        self._confirm(before if found.searched and prediction.known else None, in_map)
+        self._confirm(before.found(self.T, sure=found.sure) if found.searched else None, in_map)
         self._extend_map(scan, prediction, in_map)
 
     def _begin(self, index: int, stamp_ns: int, fine: F8) -> Row:
@@ -107,7 +107,7 @@ class Tracker:
         seen = self._judge(registration, prediction)
         weak = seen.p < self.settings.least_p
         reliable = attempt.believed and not (attempt.searched and prediction.known and weak.any())
-        if weak.any() and not attempt.searched:
+        if weak.any() and prediction.known and not attempt.searched:
             free = seen.observed(self.settings.least_p)
             registration = self._align(coarse, self.T @ prediction.T_last_now, target, free=free)
             reliable = reliable and self._credible(registration, len(coarse), prediction)
@@ -124,6 +124,7 @@ class Tracker:
             reliable,
             not weak.any(),
             attempt.searched,
+            attempt.sure,
             self.recovery.fit(registration, len(coarse)),
         )
 
@@ -177,7 +178,10 @@ class Tracker:
         So it was when this scan fits where it would be expected if that one had never been.
         """
         doubted, self.unconfirmed = self.unconfirmed, None
-        if doubted is None or len(scan.coarse) < MIN_POINTS:
+        if doubted is None or doubted.sure or len(scan.coarse) < MIN_POINTS:
+            return found
+        if not doubted.expectable:
+            self.rows.withdraw(doubted.covariance)
             return found
         again = self._align(scan.coarse, doubted.expected(scan.stamp_ns), self.map)
         n = len(scan.coarse)
@@ -256,7 +260,7 @@ class Tracker:
         if in_map and self.unconfirmed is not None:
             self.map.insert(transform(self.unconfirmed.T, self.unconfirmed.fine))
         if in_map:
-            self.unconfirmed = None if surprise is None else surprise.at(self.T)
+            self.unconfirmed = surprise
 
     def _extend_map(self, scan: ThinScan, prediction: Prediction, in_map: bool) -> None:
         """Add the scan when it was registered and the vehicle moved; start anew when the map was lost for long."""
@@ -314,6 +318,8 @@ class Found:
     well_seen: bool
     searched: bool = False
     """Found by a search, not where it was expected."""
+    sure: bool = True
+    """See `Attempt`."""
     fit: float = 0.0
     """See `Recovery.fit`."""
 
