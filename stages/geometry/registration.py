@@ -1,8 +1,6 @@
-"""Registration of a scan to a local map: robust point-to-plane Gauss-Newton on SE(3).
+"""Registration of a scan to a local map: robust Gauss-Newton on SE(3), point to plane or plane to plane.
 
-Residual of a point p (LiDAR frame) against the surface (mean m, normal n) at its nearest map point:
-e = n . (T p - m). With T <- T Exp(xi), xi = (rotation, translation), and u = R^T n: de/dxi = (p x u, u).
-The robust weight is Geman-McClure's, w = (k^2 / (k^2 + e^2))^2, as in KISS-ICP (arXiv 2209.15397).
+Residuals, their derivatives and weights are in `residuals`.
 """
 
 from __future__ import annotations
@@ -14,11 +12,12 @@ from numpy.typing import ArrayLike
 
 from scanloom.stages.geometry.halves import in_halves
 from scanloom.stages.geometry.kernels import kernel
-from scanloom.stages.geometry.se3 import F8, se3_exp
+from scanloom.stages.geometry.residuals import linearise_planes, linearise_points
+from scanloom.stages.geometry.se3 import F8, inverse, se3_exp, se3_log
 from scanloom.stages.geometry.voxel_map import F4, I4, I8, STEPS, VoxelMap, fit_surface, nearest
 from scanloom.stages.geometry.voxels import Float, Int, unpack
 
-__all__ = ["Registration", "VoxelMap", "align"]
+__all__ = ["Registration", "VoxelMap", "align", "normals_at"]
 
 ROTATION_STEP_RAD = 5e-5
 TRANSLATION_STEP_M = 1e-3
@@ -43,9 +42,10 @@ class Registration:
     inlier_ratio : share of source points whose partner's surface is nearer than the scale of the robust kernel.
     converged : the last step was below the tolerance and there were enough partners.
     iterations : searches for partners that were made.
+    gradient : (6,) b = sum w J^T e there; zero along all directions that were free.
     sigma2 : sum w e^2 / (sum w - 6), m2 (methods 1.7).
     points, normals : (k, 3) matched source points and their partners' normals, both in the source frame.
-    weights : (k,) of these residuals.
+    residuals, weights : (k,) of these: distance along the normal, m, and robust weight times that of the shape.
     normal_variance : (k,) of the direction of these normals, from the fit of their surfaces, rad2.
     """
 
@@ -56,8 +56,10 @@ class Registration:
     converged: bool
     iterations: int
     sigma2: float
+    gradient: F8
     points: F8
     normals: F8
+    residuals: F8
     weights: F8
     normal_variance: F8
 
@@ -71,6 +73,8 @@ def align(
     scale_m: float,
     max_iterations: int = 20,
     free: F8 | None = None,
+    source_normals: F8 | None = None,
+    held: F8 | None = None,
 ) -> Registration:
     """Move `source` (n, 3), m, from the initial pose (4, 4) onto the surfaces of `target`.
 
@@ -79,31 +83,48 @@ def align(
     max_distance_m : a point farther than this from every map point has no partner; at most one voxel is looked at.
     scale_m : residual at which the robust weight falls to a quarter.
     free : (6, k) directions of the tangent, as columns, in which the pose may move; all unless given.
+    source_normals : (n, 3) unit normals of the surfaces the source points lie on, zero where there is none; with them
+        residuals are plane to plane (see the module).
+    held : (6, 6) information of the initial pose, rad-2, m-2, right tangent: how well it was known before. The result is
+        then the most probable pose; `information` and `gradient` are those of the scan alone.
 
     Few partners give `converged=False` and the best pose so far; nothing is raised.
     """
     points = np.ascontiguousarray(source, dtype=np.float64).reshape(-1, 3)
     T = np.array(T_target_source, dtype=np.float64)
-    partner = _Partners(len(points))
+    partner = _Partners(points, source_normals)
+    expected, known = T, None if held is None else np.asarray(held, float)
     basis = np.eye(6) if free is None else np.asarray(free, float)
     converged, iterations = False, 0
-    H, residual = np.zeros((6, 6)), _Residuals()
+    H, b, residual = np.zeros((6, 6)), np.zeros(6), _Residuals()
     while iterations < max_iterations and not converged:
         iterations += 1
-        partner.search(target, points, T, max_distance_m)
+        partner.search(target, T, max_distance_m)
         start = T
         for _ in range(INNER_STEPS):
-            H, b, residual = partner.linearise(points, T, scale_m)
+            H, b, residual = partner.linearise(T, scale_m)
             if residual.matches < MIN_MATCHES:
                 break
+            if known is not None:
+                H, b = _with_knowledge(H, b, residual.sigma2, known, expected, T)
             step = _step(H, b, basis)
             T = T @ se3_exp(step)
             if _small(step):
                 break
         tolerance = 1.0 if iterations <= SETTLING else SETTLED
         converged = residual.matches >= MIN_MATCHES and _close(start, T, tolerance)
-    H, _, residual = partner.linearise(points, T, scale_m)
-    return _result(T, H, residual, partner, points, converged, iterations)
+    H, b, residual = partner.linearise(T, scale_m)
+    return _result(T, H, b, residual, partner, converged, iterations)
+
+
+def normals_at(points: ArrayLike, surface_points: F8, voxel_size_m: float) -> F8:
+    """Unit normals (n, 3) of the surfaces through `points` (n, 3), m, among `surface_points` (m, 3); zero without one."""
+    around = VoxelMap(voxel_size_m)
+    around.insert(surface_points)
+    partner = _Partners(np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3))
+    partner.search(around, np.eye(4), voxel_size_m)
+    normals: F8 = np.where(partner.shape[:, None] > 0, partner.normal, 0.0)
+    return normals
 
 
 @dataclass(frozen=True)
@@ -114,20 +135,30 @@ class _Residuals:
     inliers: int = 0
     inlier_square: float = 0.0
 
+    @property
+    def sigma2(self) -> float:
+        freedom = self.weight - 6
+        return self.weighted_square / freedom if freedom > 0 else float("inf")
+
 
 class _Partners:
     """For each source point: mean and direction of its partner's surface in the target, and the weight of its shape."""
 
-    def __init__(self, n: int) -> None:
+    def __init__(self, points: F8, normals: F8 | None = None) -> None:
+        n = len(points)
+        self.points = points
+        self.point_normal = None if normals is None else np.ascontiguousarray(normals, dtype=np.float64)
         self.voxel = np.full(n, -1, np.int64)
         self.place = np.zeros(n, np.int64)
         self.mean = np.zeros((n, 3))
         self.normal = np.zeros((n, 3))
         self.shape = np.zeros(n)
         self.normal_variance = np.zeros(n)
+        self.error = np.zeros(n)
         self.weight = np.zeros(n)
 
-    def search(self, target: VoxelMap, points: F8, T: F8, max_distance_m: float) -> None:
+    def search(self, target: VoxelMap, T: F8, max_distance_m: float) -> None:
+        points = self.points
         size = target.voxel_size_m
         table = (target.keys, target.values, target.voxel_key, target.count, target.offset)
         limit2 = min(max_distance_m, size) ** 2
@@ -147,15 +178,28 @@ class _Partners:
             self.normal_variance,
         )  # fmt: skip
 
-    def linearise(self, points: F8, T: F8, scale_m: float) -> tuple[F8, F8, _Residuals]:
+    def linearise(self, T: F8, scale_m: float) -> tuple[F8, F8, _Residuals]:
+        """H (6, 6), b (6,) and the sums of the residuals; their errors and weights are kept."""
         H, b = np.zeros((6, 6)), np.zeros(6)
-        sums = _linearise(points, T, scale_m**2, self.mean, self.normal, self.shape, H, b, self.weight)
+        surfaces, results = (self.mean, self.normal, self.shape), (H, b, self.error, self.weight)
+        if self.point_normal is None:
+            sums = linearise_points(self.points, T, scale_m**2, *surfaces, *results)
+        else:
+            sums = linearise_planes(self.points, self.point_normal, T, scale_m**2, *surfaces, *results)
         return H, b, _Residuals(*sums)
 
 
 def _step(H: F8, b: F8, basis: F8) -> F8:
     step: F8 = basis @ np.linalg.lstsq(basis.T @ H @ basis, -basis.T @ b, rcond=1e-12)[0]
     return step
+
+
+def _with_knowledge(H: F8, b: F8, sigma2: float, known: F8, expected: F8, T: F8) -> tuple[F8, F8]:
+    """The normal equations with what was known of the pose before, in units of the residuals' variance."""
+    if not np.isfinite(sigma2):
+        return H, b
+    prior = sigma2 * known
+    return H + prior, b + prior @ se3_log(inverse(expected) @ T)
 
 
 def _small(step: F8) -> bool:
@@ -172,10 +216,10 @@ def _close(a: F8, b: F8, tolerance: float) -> bool:
 
 
 def _result(
-    T: F8, H: F8, residual: _Residuals, partner: _Partners, points: F8, converged: bool, iterations: int
+    T: F8, H: F8, b: F8, residual: _Residuals, partner: _Partners, converged: bool, iterations: int
 ) -> Registration:
     matched = partner.shape > 0
-    freedom = residual.weight - 6
+    points = partner.points
     return Registration(
         T_target_source=T,
         information=H,
@@ -185,9 +229,11 @@ def _result(
         inlier_ratio=residual.inliers / max(len(points), 1),
         converged=converged,
         iterations=iterations,
-        sigma2=residual.weighted_square / freedom if freedom > 0 else float("inf"),
+        sigma2=residual.sigma2,
+        gradient=b,
         points=points[matched],
         normals=partner.normal[matched] @ T[:3, :3],
+        residuals=partner.error[matched],
         weights=partner.weight[matched],
         normal_variance=partner.normal_variance[matched],
     )
@@ -261,43 +307,3 @@ def _gather(
             normal[n, r] = surface[v, c, 3 + r]
         shape[n] = surface[v, c, 6]
         normal_variance[n] = surface[v, c, 7]
-
-
-@kernel
-def _linearise(
-    points: F8, T: F8, scale2: Float, mean: F8, normal: F8, shape: F8, H: F8, b: F8, weight: F8
-) -> tuple[int, float, float, int, float]:
-    J = np.empty(6)
-    matches, inliers = 0, 0
-    total = square = inlier_square = 0.0
-    for n in range(len(points)):
-        weight[n] = 0.0
-        if shape[n] <= 0.0:
-            continue
-        px, py, pz = points[n, 0], points[n, 1], points[n, 2]
-        nx, ny, nz = normal[n, 0], normal[n, 1], normal[n, 2]
-        e = nx * (T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3] - mean[n, 0])
-        e += ny * (T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3] - mean[n, 1])
-        e += nz * (T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3] - mean[n, 2])
-        ux = T[0, 0] * nx + T[1, 0] * ny + T[2, 0] * nz
-        uy = T[0, 1] * nx + T[1, 1] * ny + T[2, 1] * nz
-        uz = T[0, 2] * nx + T[1, 2] * ny + T[2, 2] * nz
-        J[0], J[1], J[2] = py * uz - pz * uy, pz * ux - px * uz, px * uy - py * ux
-        J[3], J[4], J[5] = ux, uy, uz
-        robust = scale2 / (scale2 + e * e)
-        w = robust * robust * shape[n]
-        weight[n] = w
-        matches += 1
-        total += w
-        square += w * e * e
-        if e * e <= scale2:
-            inliers += 1
-            inlier_square += e * e
-        for r in range(6):
-            b[r] += w * J[r] * e
-            for s in range(r, 6):
-                H[r, s] += w * J[r] * J[s]
-    for r in range(6):
-        for s in range(r):
-            H[r, s] = H[s, r]
-    return matches, total, square, inliers, inlier_square
