@@ -7,6 +7,7 @@ y = (r * rotation, translation), with r the root mean square range of the matche
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -19,6 +20,7 @@ SNR = 10.0
 POINT_NOISE_M = 0.02
 BLIND_STD_M = 10.0
 EIGENVALUE_FLOOR = 1e-9
+LEAST_POINTS = 6
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class Degeneracy:
     Attributes
     ----------
     d : D, smallest eigenvalue of the Schur complement H_tt - H_tr H_rr^-1 H_rt, per unit weight (0 blind, 1/3 best).
-    e_m : E1, sqrt(lambda_max([sigma2 H^-1]_tt)), m.
+    e_m : E in the form asked for, see `indicator`, m.
     p : (6,) probability that each direction is observed beyond noise (DRPM, arXiv 2410.10784), weakest first.
     directions : (6, 6) eigenvectors as columns in the scaled tangent, weakest first.
     eigenvalues : (6,) of the scaled information, increasing.
@@ -57,15 +59,49 @@ def blind() -> Degeneracy:
     return Degeneracy(0.0, BLIND_STD_M, np.zeros(6), np.eye(6), np.zeros(6), 1.0)
 
 
+Indicator = Literal["E1", "E2", "E3"]
+INDICATORS: tuple[Indicator, ...] = get_args(Indicator)
+
+
+def indicator(registration: Registration, kind: Indicator = "E1") -> float:
+    """E of a registration, m; the larger, the worse; `BLIND_STD_M` at most (methods 1.7).
+
+    E1 : sqrt(lambda_max([sigma2 H^-1]_tt)), worst standard deviation of translation: geometry times residual.
+    E2 : rmse / inlier ratio: pure error of matching.
+    E3 : E1 / inlier ratio. What found no partner lies in free or unknown space of the map; its share stands in for one
+        counted in an occupancy grid, which the local map is not.
+    """
+    value = float("inf")
+    share = registration.inlier_ratio
+    if kind == "E2":
+        value = registration.rmse_m / share if share > 0 else value
+    elif len(registration.points) >= LEAST_POINTS:
+        value = _worst_translation(registration.information, registration.sigma2)
+        if kind == "E3":
+            value = value / share if share > 0 else BLIND_STD_M
+    return min(value, BLIND_STD_M)
+
+
+def translation_information(registration: Registration) -> float:
+    """D: smallest eigenvalue of the Schur complement H_tt - H_tr H_rr^-1 H_rt, per unit weight (0 blind, 1/3 best)."""
+    return _translation_information(registration.information) / max(
+        float(registration.weights.sum()), EIGENVALUE_FLOOR
+    )
+
+
 def judge(
-    registration: Registration, *, point_noise_m: float = POINT_NOISE_M, snr: float = SNR
+    registration: Registration,
+    *,
+    point_noise_m: float = POINT_NOISE_M,
+    snr: float = SNR,
+    kind: Indicator = "E1",
 ) -> Degeneracy:
-    """D, E1 and the probabilities p of a registration.
+    """D, E and the probabilities p of a registration.
 
     p_k = Phi((lambda_k / (1 + SNR) - mean_k) / std_k), where mean and std are those of the information that noise of
     points (`point_noise_m`) and of fitted normals alone would give along direction k.
     """
-    if len(registration.points) < 6:
+    if len(registration.points) < LEAST_POINTS:
         return blind()
     range_m = float(np.sqrt((registration.points**2).sum(axis=1).mean()))
     scale = _scale(range_m)
@@ -78,8 +114,8 @@ def judge(
     )  # fmt: skip
     p = _normal_cdf((eigenvalues / (1 + snr) - mean) / np.sqrt(np.maximum(variance, EIGENVALUE_FLOOR)))
     return Degeneracy(
-        d=_translation_information(H) / max(float(registration.weights.sum()), EIGENVALUE_FLOOR),
-        e_m=_worst_translation(H, registration.sigma2),
+        d=translation_information(registration),
+        e_m=indicator(registration, kind),
         p=p,
         directions=directions,
         eigenvalues=np.maximum(eigenvalues, 0.0),
