@@ -1,4 +1,7 @@
-"""Scans that fit nowhere in the map, kept aside: if they fit each other they become a segment of their own."""
+"""Scans that fit nowhere in the map, kept aside: if they fit each other they become the map.
+
+Where sensors did not tell how they were reached, a new segment begins with them.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +25,9 @@ class Aside:
 
     map: VoxelMap
     first: int
+    measured: bool
+    """Whether sensors told the motion from the row before the first; `covariance` (6, 6) is that of this motion."""
     covariance: F8
-    """Of the motion from the row before the first, (6, 6): nothing tells it."""
     scans: int = 0
 
     def insert(self, points: F8) -> None:

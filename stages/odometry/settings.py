@@ -69,7 +69,10 @@ class Settings(BaseModel):
     )
     point_noise_m: float = Field(0.02, ge=0.001, le=1.0, description="noise of a point, m")
     covariance_inflation: float = Field(
-        4.0, ge=0.1, le=1000.0, description="factor on sigma^2 / lambda: residuals share the map's errors"
+        0.6,
+        ge=0.1,
+        le=1000.0,
+        description="factor on the covariance of a registration; below 1, for one scan repeats errors of the one before",
     )
-    floor_m: float = Field(0.002, ge=0.0, le=1.0, description="least standard deviation of translation, m")
-    floor_rad: float = Field(0.0001, ge=0.0, le=0.1, description="least standard deviation of rotation, rad")
+    floor_m: float = Field(0.0005, ge=0.0, le=1.0, description="least standard deviation of translation, m")
+    floor_rad: float = Field(0.00003, ge=0.0, le=0.1, description="least standard deviation of rotation, rad")

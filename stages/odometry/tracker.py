@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scanloom.stages.geometry.degeneracy import Degeneracy, blind, judge, scan_covariance
+from scanloom.stages.geometry.degeneracy import Degeneracy, blind, judge
 from scanloom.stages.geometry.registration import Registration, VoxelMap, align
 from scanloom.stages.geometry.se3 import F8, inverse, se3_log, transform
 from scanloom.stages.odometry.aside import Aside, Unconfirmed, unknown_motion
+from scanloom.stages.odometry.belief import Belief
 from scanloom.stages.odometry.prediction import Prediction, Predictor, forward_guesses
 from scanloom.stages.odometry.recovery import Attempt, Recovery
 from scanloom.stages.odometry.rows import Row, Rows
@@ -33,7 +34,7 @@ class Tracker:
 
     A scan that does not fit where it is expected is searched for around; one that is found by surprise enters the map when
     the next scan agrees. Scans that fit nowhere are bridged by prediction; where sensors do not tell the motion either,
-    they are kept aside and become a segment of their own when they fit each other.
+    they become a segment of their own. Either way they are kept aside, and go on as the map when they fit each other.
     """
 
     def __init__(self, settings: Settings, predictor: Predictor, T_base_lidar: F8) -> None:
@@ -51,6 +52,8 @@ class Tracker:
         self.inserted_T = np.eye(4)
         self.dropped_m = np.zeros(3)
         self.recovery = Recovery(T_base_lidar)
+        self.floor: F8 = np.diag([settings.floor_rad**2] * 3 + [settings.floor_m**2] * 3)
+        self.belief = Belief(self.floor)
         self.fruitless = 0
         self.aside: Aside | None = None
         self.unconfirmed: Unconfirmed | None = None
@@ -66,7 +69,7 @@ class Tracker:
         if self.unconfirmed is not None and (found.searched or not found.reliable):
             found = self._second_thoughts(scan, prediction, found)
         in_map = found.reliable
-        if not in_map and not prediction.measured:
+        if not in_map:
             found = self._register_aside(scan, prediction, found)
         self._move(scan.stamp_ns, prediction, found, in_map)
         self.rows.add(
@@ -91,8 +94,7 @@ class Tracker:
         self.map.insert(fine)
         self.last_ns = self.keyframe_ns = stamp_ns
         enough = len(fine) >= MIN_POINTS
-        floor = np.diag([self.settings.floor_rad**2] * 3 + [self.settings.floor_m**2] * 3)
-        return Row(index, stamp_ns, self.T, floor, 1.0 if enough else 0.0, 0.0, blind(), True, enough)
+        return Row(index, stamp_ns, self.T, self.floor, 1.0 if enough else 0.0, 0.0, blind(), True, enough)
 
     def _register(self, coarse: F8, prediction: Prediction, target: VoxelMap) -> Found:
         """Align to the map from the prediction; directions the scan does not tell stay as predicted."""
@@ -109,15 +111,13 @@ class Tracker:
         reliable = attempt.believed and not (attempt.searched and prediction.known and weak.any())
         if weak.any() and prediction.known and not attempt.searched:
             free = seen.observed(self.settings.least_p)
-            registration = self._align(coarse, self.T @ prediction.T_last_now, target, free=free)
+            registration = self._align_expected(coarse, prediction, target, free)
             reliable = reliable and self._credible(registration, len(coarse), prediction)
-        covariance = scan_covariance(
-            seen, registration.sigma2, inflation=self.settings.covariance_inflation, floor_m=self.settings.floor_m,
-            floor_rad=self.settings.floor_rad, predicted=prediction.covariance, least_p=self.settings.least_p,
-        )  # fmt: skip
+        information = seen.scan_information(self.settings.least_p, self.settings.covariance_inflation)
+        belief, covariance = self._believed().registered(prediction, information)
         return Found(
             inverse(self.T) @ registration.T_target_source,
-            covariance if reliable else prediction.covariance,
+            covariance + self.floor if reliable else prediction.covariance,
             registration.inlier_ratio,
             registration.rmse_m,
             seen,
@@ -126,12 +126,17 @@ class Tracker:
             attempt.searched,
             attempt.sure,
             self.recovery.fit(registration, len(coarse)),
+            belief,
         )
+
+    def _believed(self) -> Belief:
+        """What is known of the last pose. While lost the motion counts from where the map was left (see `Rows.settle`)."""
+        return Belief(self.floor) if self.rows.lost else self.belief
 
     def _attempt(self, coarse: F8, prediction: Prediction, target: VoxelMap) -> Attempt:
         """From the prediction; where that fails (slip, nothing known yet) the best from other starts, else searched for."""
         expected, n = self.T @ prediction.T_last_now, len(coarse)
-        first = self._align(coarse, expected, target)
+        first = self._align_expected(coarse, prediction, target)
         tries = [first] if self._credible(first, n, prediction) else []
         if prediction.known and tries and not self.recovery.doubts(first, n):
             return Attempt(first, searched=False, believed=True)
@@ -162,7 +167,7 @@ class Tracker:
         if (seen.p >= self.settings.least_p).all():
             return False
         free = seen.observed(self.settings.least_p)
-        held = self._align(coarse, self.T @ prediction.T_last_now, target, free=free)
+        held = self._align_expected(coarse, prediction, target, free)
         n = len(coarse)
         return self._credible(held, n, prediction) and not self.recovery.doubts(held, n)
 
@@ -191,7 +196,7 @@ class Tracker:
         return self._found(Attempt(again, searched=True, believed=True), scan.coarse, prediction, self.map)
 
     def _register_aside(self, scan: ThinScan, prediction: Prediction, found: Found) -> Found:
-        """Nothing tells the motion: register the scan to those lost before it, else begin with it anew."""
+        """The scan fits nowhere in the map: register it to those lost before it, else begin with it anew."""
         if len(scan.coarse) < MIN_POINTS:
             return found
         if self.aside is not None:
@@ -199,14 +204,25 @@ class Tracker:
             if again.reliable:
                 return again
         pause_s = 1e-9 * (scan.stamp_ns - self.last_ns)
-        self.aside = Aside(self._new_map(), len(self.rows), unknown_motion(prediction, pause_s))
+        told = prediction.covariance if prediction.measured else unknown_motion(prediction, pause_s)
+        self.aside = Aside(self._new_map(), len(self.rows), prediction.measured, told)
         return found
 
-    def _align(self, coarse: F8, T: F8, target: VoxelMap, free: F8 | None = None) -> Registration:
+    def _align_expected(
+        self, coarse: F8, prediction: Prediction, target: VoxelMap, free: F8 | None = None
+    ) -> Registration:
+        """From the predicted pose, which counts as far as it is known; not at all while the map is lost."""
+        known = prediction.known and not self.rows.lost
+        held = np.linalg.inv(self.belief.expected(prediction)) if known else None
+        return self._align(coarse, self.T @ prediction.T_last_now, target, free, held)
+
+    def _align(
+        self, coarse: F8, T: F8, target: VoxelMap, free: F8 | None = None, held: F8 | None = None
+    ) -> Registration:
         scale = float(np.clip(self.deviation.rms_m, self.settings.least_scale_m, self.settings.most_scale_m))
         return align(
             target, coarse, T, max_distance_m=self.settings.voxel_size_m, scale_m=scale,
-            max_iterations=self.settings.max_iterations, free=free,
+            max_iterations=self.settings.max_iterations, free=free, held=held,
         )  # fmt: skip
 
     def _credible(self, registration: Registration, points: int, prediction: Prediction) -> bool:
@@ -243,6 +259,7 @@ class Tracker:
         if found.reliable:
             seen_motion = motion if last_ns == self.rows.last_ns else inverse(T_last) @ self.T
             self.predictor.learn(last_ns, stamp_ns, seen_motion, well_seen=found.well_seen)
+        self.belief = found.belief if found.reliable and found.belief else self.belief.predicted(prediction)
         self._remember(found, in_map)
 
     def _remember(self, found: Found, in_map: bool) -> None:
@@ -269,7 +286,9 @@ class Tracker:
         elif self.aside is not None:
             self.aside.insert(transform(self.T, scan.fine))
         if self.aside is not None and self.aside.enough:
-            self.rows.split(self.aside.first, self.aside.covariance)
+            if not self.aside.measured:
+                self.rows.split(self.aside.first, self.aside.covariance)
+            self.rows.sure = len(self.rows) - 1
             self._start_anew(self.aside.map)
             return
         if self.bridged >= MAX_BRIDGED or len(self.map) < MIN_POINTS:
@@ -291,6 +310,7 @@ class Tracker:
     def _start_anew(self, new: VoxelMap) -> None:
         self.map, self.bridged, self.inlier_ratio, self.recovery.usual = new, 0, 0.0, 0.0
         self.inserted_T, self.aside, self.unconfirmed = self.T, None, None
+        self.belief = Belief(self.floor)
 
     def _is_keyframe(self, stamp_ns: int) -> bool:
         late = stamp_ns - self.keyframe_ns >= self.settings.keyframe_s * 1e9
@@ -322,6 +342,8 @@ class Found:
     """See `Attempt`."""
     fit: float = 0.0
     """See `Recovery.fit`."""
+    belief: Belief | None = None
+    """What is known of the pose in the map."""
 
     @classmethod
     def nothing(cls, prediction: Prediction) -> Found:
