@@ -2,7 +2,9 @@
 
     python -m benchmarks.odometry                                            everything
     python -m benchmarks.odometry --sequences town_32 --systems scanloom     one sequence, ours only: some seconds
+    python -m benchmarks.odometry --quick                                    town and real scans, without the extras
     python -m benchmarks.odometry --data FOLDER --json -                     one more log, figures as JSON
+    python -m benchmarks.odometry --set voxel_size_m=0.5                     ours with another setting
 
 What the peers say of a sequence is kept (build/bench/results) until the peer's version or the sequence changes, so a
 change of ours is measured against it in seconds; `--fresh` runs them again, which times need to be comparable.
@@ -11,63 +13,44 @@ change of ours is measured against it in seconds; `--fresh` runs them again, whi
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
-import os
-import subprocess
-import sys
-import tempfile
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
-from benchmarks import scores, systems
+from benchmarks import display, pairs, systems, tunnel, walls
+from benchmarks.comparison import OURS, OWN_SCANS, PEERS, SYSTEMS, Result, Runner, best, ratios
 from benchmarks.scores import Figure, Score
 from benchmarks.sequences import Recording, drives, make
-from benchmarks.systems import Outcome
-from scanloom.schemas.trajectory import Truth
 
 WORK = Path("build/bench")
-KITTI_FOLDER = Path("../shared/data/kitti_raw_0005")
-WIDTH = 180
-PEERS = ("kiss_icp", "small_gicp")
-SYSTEMS = ("scanloom", *PEERS)
-VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
-    "scanloom": {"": {}},
-    "kiss_icp": {"deskew": {"deskew": True}},
-    "small_gicp": {
-        f"{scans}_{voxel:g}m": {"voxel_m": voxel, "scans": scans}
-        for scans in ("own", "ours")
-        for voxel in (0.5, 1.0)
-    },
-}
-"""Of a system with variants the one with the smaller error over 10 m stands for it, sequence by sequence."""
+REAL_SCANS = Path("../shared/data/kitti_raw_0005")
+HANDHELD = Path("../shared/data/deskew_newer_06")
+QUICK = ("town_32", "kitti_raw_0005")
+PREFIX = "bench.odometry"
+PAIRS = 2000
 
-console = Console(stderr=True, width=180)
+console = Console(stderr=True, width=200)
 
 
 def main(words: Sequence[str] | None = None) -> None:
+    """Everything the command line asks for."""
     options = _options(words)
-    folders = [*options.data]
-    if KITTI_FOLDER.exists() and not any(f.resolve() == KITTI_FOLDER.resolve() for f in folders):
-        folders.append(KITTI_FOLDER)
-    recordings = make(drives(folders, options.sequences), WORK / "store")
-    figures: list[Figure] = []
-    table = _table()
-    for recording in recordings:
-        for system in options.systems:
-            if not systems.version(system):
-                continue
-            name, outcome, said = best(system, recording, options.fresh)
-            place = f"bench.odometry.{recording.name}.{system}"
-            figures += [Figure(f"{place}.{s.name}", s.value, s.unit, recording.name, s.method) for s in said]
-            _add_row(table, recording, system, name, said)
-    (console if options.json == "-" else Console(width=WIDTH)).print(table)
-    _write_json(figures, options.json)
+    started = time.monotonic()
+    _greet(options.systems)
+    recordings = _recordings(options)
+    runner = Runner(WORK / "results", options.fresh, options.set)
+    results = [
+        list(runner.results(s, r)) for r in _told(recordings) for s in options.systems if systems.version(s)
+    ]
+    chosen = {(found[0].recording.name, found[0].system): best(found) for found in results}
+    figures = [*_figures(chosen), *_variants(results), *_ratios(chosen, results)]
+    if not options.quick and OURS in options.systems:
+        figures += _extras(runner, recordings, chosen, options)
+    _show(options, figures, chosen, time.monotonic() - started)
 
 
 def _options(words: Sequence[str] | None) -> argparse.Namespace:
@@ -77,89 +60,119 @@ def _options(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--data", type=Path, action="append", default=[], help="a log to compare on as well")
     parser.add_argument("--sequences", nargs="+", default=[], help="only these")
     parser.add_argument("--systems", nargs="+", default=SYSTEMS, choices=SYSTEMS, help="only these")
+    parser.add_argument(
+        "--quick", action="store_true", help=f"only {', '.join(QUICK)}; no pairs, no tunnel, no walls"
+    )
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="a setting of our odometry"
+    )
     parser.add_argument("--json", default="", help="file for the figures, - for standard output")
+    parser.add_argument("--out", type=Path, default=WORK, help="folder for the picture and the figures")
     parser.add_argument("--fresh", action="store_true", help="run the peers again")
-    return parser.parse_args(words)
+    options = parser.parse_args(words)
+    options.set = {
+        name: json.loads(value) for name, _, value in (word.partition("=") for word in options.set)
+    }
+    return options
 
 
-def best(system: str, recording: Recording, fresh: bool) -> tuple[str, Outcome, list[Score]]:
-    """The variant with the smallest error over 10 m: its name, what it said, its scores."""
-    truth = recording.one(Truth)
-    tried = []
-    variants = VARIANTS[system]
-    if system == "kiss_icp" and not recording.simulated:
-        variants = {**variants, "raw": {"deskew": False}}
-    for name, options in variants.items():
-        outcome = outcome_of(system, recording, options, fresh)
-        said = [*scores.accuracy(truth, outcome, len(recording)), *scores.cost(outcome)]
-        if system == "scanloom":
-            said += ours(truth, recording, outcome)
-        tried.append((name, outcome, said))
-    return min(tried, key=lambda one: next((s.value for s in one[2] if s.name == "rpe10_m"), np.inf))
-
-
-def ours(truth: Truth, recording: Recording, outcome: Outcome) -> list[Score]:
-    """What only our odometry tells."""
-    deskew_ms = outcome.extra["deskew_ms"]
-    said = [
-        Score("deskew_ms_per_frame", float(np.median(deskew_ms)), "ms", "median, compute only, one thread"),
-        Score("unreliable_scans", int((~outcome.extra["reliable"]).sum()), "", "scans bridged by prediction"),
-    ]
-    if recording.simulated:
-        squares = scores.nees(truth, outcome)
-        said.append(
-            Score("nees", float(squares.mean()), "", "mean over the motions between consecutive scans")
+def _greet(wanted: Sequence[str]) -> None:
+    missing = [system for system in wanted if not systems.version(system)]
+    if missing:
+        console.print(
+            f"[yellow]{' and '.join(missing)} not installed: run `make bench-setup`; going on without.[/]"
         )
-        said.append(
-            Score("nees_median", float(np.median(squares)), "", "median of the same; 5.35 is expected")
+
+
+def _recordings(options: argparse.Namespace) -> list[Recording]:
+    folders = list(options.data)
+    if REAL_SCANS.exists() and all(folder.resolve() != REAL_SCANS.resolve() for folder in folders):
+        folders.append(REAL_SCANS)
+    wanted = options.sequences or (QUICK if options.quick else ())
+    chosen = drives(folders, [name for name in wanted if name != QUICK[1] or REAL_SCANS.exists()])
+    with console.status("making the sequences"):
+        return make(chosen, WORK / "store")
+
+
+def _told(recordings: Sequence[Recording]) -> Iterator[Recording]:
+    for recording in recordings:
+        with console.status(f"systems on {recording.name}"):
+            yield recording
+
+
+def _figures(chosen: Mapping[tuple[str, str], Result]) -> Iterator[Figure]:
+    for (sequence, system), result in chosen.items():
+        for score in result.scores:
+            variant = f"; {result.variant}" if result.variant else ""
+            yield _figure(f"{sequence}.{system}.{score.name}", score, sequence, variant)
+
+
+def _variants(results: Sequence[Sequence[Result]]) -> Iterator[Figure]:
+    """Of every variant the figures that choose among them."""
+    for found in results:
+        for result in found if len(found) > 1 else ():
+            for score in result.scores:
+                if score.name in ("rpe10_m", "ms_per_frame", "lost_scans"):
+                    place = f"{result.recording.name}.{result.system}.{result.variant}.{score.name}"
+                    yield _figure(place, score, result.recording.name)
+
+
+def _ratios(
+    chosen: Mapping[tuple[str, str], Result], results: Sequence[Sequence[Result]]
+) -> Iterator[Figure]:
+    apart = {
+        (found[0].recording.name, found[0].system): best(
+            [r for r in found if r.variant.startswith(OWN_SCANS)]
         )
-    return said
+        for found in results
+        if found[0].system == PEERS[1]
+    }
+    for score in ratios(chosen, apart):
+        yield _figure(score.name, score, "all")
 
 
-def outcome_of(system: str, recording: Recording, options: dict[str, Any], fresh: bool) -> Outcome:
-    """Run a system in a process of its own; a peer's earlier outcome is taken when there is one."""
-    words = "-".join(f"{k}={v}" for k, v in sorted(options.items()))
-    name = "_".join(filter(None, (recording.name, system, systems.version(system), words, recording.digest)))
-    kept = WORK / "results" / f"{name}.npz"
-    if system in PEERS and options.get("scans") != "ours" and kept.exists() and not fresh:
-        return Outcome.read(kept)
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as folder, console.status(f"{recording.name}: {system} {words}"):
-        order = {
-            "system": system, "options": options, "out": str(kept), "recording": dataclasses.asdict(recording),
-        }  # fmt: skip
-        path = Path(folder) / "order.json"
-        path.write_text(json.dumps(order))
-        environment = {**os.environ}
-        for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-            environment.pop(threads, None)
-        subprocess.run([sys.executable, "-m", "benchmarks.systems", str(path)], check=True, env=environment)
-    return Outcome.read(kept)
+def _extras(
+    runner: Runner,
+    recordings: Sequence[Recording],
+    chosen: Mapping[tuple[str, str], Result],
+    options: argparse.Namespace,
+) -> Iterator[Figure]:
+    by_name = {recording.name: recording for recording in recordings}
+    if "tunnel" in by_name:
+        with console.status("tunnel without degeneracy handling"):
+            for score in tunnel.scores(runner, by_name, chosen):
+                yield _figure(f"tunnel.{score.name}", score, "tunnel")
+    if not options.sequences:
+        with console.status("matching and other pairs"):
+            for score in pairs.scores(pairs.judge_all(runner, recordings, PAIRS)):
+                yield _figure(f"pairs.{score.name}", score, "pairs")
+    for score in walls.scores(HANDHELD if HANDHELD.exists() else None):
+        yield Figure(f"bench.deskew.{score.name}", score.value, score.unit, "walls", score.method)
 
 
-COLUMNS = ("rpe1_m", "rpe5_m", "rpe10_m", "rpe20_m", "kitti_t_rel_percent", "ate_m", "nees", "ms_per_frame",
-           "ms_per_frame_p95", "deskew_ms_per_frame", "peak_rss_mb", "unreliable_scans", "lost_scans")  # fmt: skip
+def _figure(name: str, score: Score, scope: str, more: str = "") -> Figure:
+    return Figure(f"{PREFIX}.{name}", score.value, score.unit, scope, score.method + more)
 
 
-def _table() -> Table:
-    table = Table(title="odometry")
-    for column in ("sequence", "system", *COLUMNS):
-        table.add_column(column.replace("_per_frame", "").replace("_", " "), justify="left")
-    return table
-
-
-def _add_row(table: Table, recording: Recording, system: str, name: str, said: Sequence[Score]) -> None:
-    values = {score.name: score.value for score in said}
-    cells = [f"{values[c]:.4g}" if c in values else "" for c in COLUMNS]
-    table.add_row(recording.name, f"{system} {name}".strip(), *cells)
-
-
-def _write_json(figures: Sequence[Figure], target: str) -> None:
-    text = json.dumps([figure.row() for figure in figures], indent=1)
-    if target == "-":
+def _show(
+    options: argparse.Namespace,
+    figures: list[Figure],
+    chosen: Mapping[tuple[str, str], Result],
+    seconds: float,
+) -> None:
+    figures.append(Figure("bench.run.wall_s", seconds, "s", "run", "wall time of this benchmark"))
+    rows = [figure.row() for figure in figures if np.isfinite(figure.value)]
+    text = json.dumps(rows, indent=1)
+    options.out.mkdir(parents=True, exist_ok=True)
+    display.picture(chosen, options.out / "odometry.png")
+    if options.json == "-":
         print(text)
-    elif target:
-        Path(target).write_text(text + "\n")
+    else:
+        Path(options.json or options.out / "odometry.json").write_text(text + "\n")
+    screen = console if options.json == "-" else Console(width=200)
+    screen.print(display.comparison(chosen))
+    screen.print(display.summary(figures))
+    screen.print(f"picture: {options.out / 'odometry.png'}; {seconds:.0f} s")
 
 
 if __name__ == "__main__":

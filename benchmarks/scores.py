@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import dataclasses
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.systems import Outcome
 from scanloom.schemas.trajectory import Truth
@@ -40,10 +42,15 @@ class Score:
     method: str
 
 
+def interpolated(truth: Truth, stamp_ns: NDArray[np.int64]) -> tuple[F8, NDArray[np.bool_]]:
+    """True poses (m, 4, 4) at those of the stamps (n,) that truth covers, and which these are (n,)."""
+    covered = inside(truth.stamp_ns, stamp_ns)
+    return interpolate_poses(truth.stamp_ns, truth.T_truth_lidar, stamp_ns[covered]), covered
+
+
 def true_poses(truth: Truth, outcome: Outcome) -> tuple[F8, F8]:
     """True poses at the system's own stamps, and the system's, (m, 4, 4) each, where truth has them."""
-    covered = inside(truth.stamp_ns, outcome.stamp_ns)
-    true = interpolate_poses(truth.stamp_ns, truth.T_truth_lidar, outcome.stamp_ns[covered])
+    true, covered = interpolated(truth, outcome.stamp_ns)
     return true, outcome.T[covered]
 
 
@@ -76,10 +83,54 @@ def cost(outcome: Outcome) -> Iterator[Score]:
     yield Score("ms_per_frame_p95", float(np.percentile(outcome.ms, 95)), "ms", f"95th percentile, {how}")
     yield Score("ms_per_frame_mean", float(outcome.ms.mean()), "ms", f"mean, {how}")
     yield Score("threads", outcome.threads, "", "threads that compute")
+    yield from peak(outcome)
+
+
+def peak(outcome: Outcome) -> Iterator[Score]:
+    """Largest memory, when the run was one that reads scan by scan."""
     if np.isfinite(outcome.peak_mb):
+        how = "resident memory of the process, interpreter and libraries included, scans read one by one"
+        yield Score("peak_rss_mb", outcome.peak_mb, "MB", how)
+
+
+def with_coarse_truth(said: Sequence[Score], coarse: Truth, outcome: Outcome, frames: int) -> Iterator[Score]:
+    """Scores against the reference, and those against the log's own truth: drift and ATE in their place, RPE beside."""
+    own = {score.name: score for score in accuracy(coarse, outcome, frames)}
+    for score in said:
+        if score.name == "ate_m":
+            yield dataclasses.replace(
+                own.get("ate_m", score), method="rms after rigid alignment; truth: GNSS/INS"
+            )
+        elif score.name.startswith("rpe"):
+            yield dataclasses.replace(score, method=f"{score.method}; reference: scans joined in one graph")
+        else:
+            yield score
+    for name in ("rpe10_m", "rpe10_deg"):
+        if name in own:
+            method = f"{own[name].method}; truth: GNSS/INS, no better than 0.3 to 0.5 m"
+            yield dataclasses.replace(own[name], name=f"{name}_gnss_ins", method=method)
+
+
+def deskewing(outcome: Outcome) -> Iterator[Score]:
+    """Time of deskew."""
+    ms, how = outcome.extra["deskew_ms"], "compute only, one core"
+    yield Score("deskew_ms_per_frame", float(np.median(ms)), "ms", f"median, {how}")
+    yield Score("deskew_ms_per_frame_mean", float(ms.mean()), "ms", f"mean, {how}")
+    with_files = float(outcome.extra["deskew_io_ms"])
+    yield Score("deskew_ms_per_frame_files", with_files, "ms", "mean, Parquet read and written, one core")
+
+
+def candour(truth: Truth | None, outcome: Outcome) -> Iterator[Score]:
+    """How honest our odometry is about itself; against exact truth where there is such."""
+    yield Score(
+        "unreliable_scans", int((~outcome.extra["reliable"]).sum()), "", "scans bridged by prediction"
+    )
+    if truth is not None:
+        squares = nees(truth, outcome)
         yield Score(
-            "peak_rss_mb", outcome.peak_mb, "MB", "of the process, interpreter and libraries included"
+            "nees", float(squares.mean()), "", "mean over the motions between consecutive scans, 6 is right"
         )
+        yield Score("nees_median", float(np.median(squares)), "", "median of the same, 5.35 is right")
 
 
 def nees(truth: Truth, outcome: Outcome) -> F8:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -39,8 +39,6 @@ class Drive:
     title: str
     simulate: Settings | None = None
     folder: Path | None = None
-    stretch_m: tuple[float, float] | None = None
-    """Of the lap, by arc length: where the drive is what its name says. All of it unless given."""
 
 
 _TOWN = {"start_m": 150.0, "duration_s": 36.0}
@@ -64,8 +62,9 @@ class Recording:
     simulated: bool
     files: Mapping[str, Sequence[str]]
     digest: str
-    """Of the raw scans and truth: results of systems that read nothing else are kept under it."""
-    settings: Settings = field(default_factory=dict)
+    """Of raw scans and truth: what systems say that read nothing else is kept under it."""
+    deskewed_digest: str
+    """The same with the deskewed scans."""
 
     def __len__(self) -> int:
         """Number of scans."""
@@ -123,12 +122,16 @@ def _sequence(drive: Drive, result: Result) -> Recording:
         ]
         for product in PRODUCTS
     }
-    digests = sorted(
+    raw, deskewed = _digest(drive, result, Scans, Truth), _digest(drive, result, Scans, Truth, Deskewed)
+    return Recording(drive.name, drive.title, drive.folder is None, files, raw, deskewed)
+
+
+def _digest(drive: Drive, result: Result, *products: type[Product]) -> str:
+    found = sorted(
         part.digest
         for where, artifact in result.artifacts
         if dict(where).get("session") == drive.name
-        for product in (Scans, Truth)
+        for product in products
         for part in artifact.of(product)
     )
-    digest = hashlib.sha256("".join(digests).encode()).hexdigest()[:16]
-    return Recording(drive.name, drive.title, drive.folder is None, files, digest, drive.simulate or {})
+    return hashlib.sha256("".join(found).encode()).hexdigest()[:16]
