@@ -14,6 +14,7 @@ import numpy as np
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.registration import Registration
 from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.voxel_map import I8
 from scanloom.stages.geometry.voxels import Float
 
 SNR = 10.0
@@ -21,6 +22,9 @@ POINT_NOISE_M = 0.02
 BLIND_STD_M = 10.0
 EIGENVALUE_FLOOR = 1e-9
 LEAST_POINTS = 6
+PATCH_RAD = (np.radians(30.0), np.radians(2.5))
+"""Azimuth and elevation of a patch of the view: a few beams, and a stretch of one surface."""
+INDEPENDENT_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,7 @@ class Degeneracy:
     directions : (6, 6) eigenvectors as columns in the scaled tangent, weakest first.
     eigenvalues : (6,) of the scaled information, increasing.
     range_m : r, the scale of rotation.
+    scatter : (6, 6) covariance of the gradient at the solution, along `directions`, m2: see `judge`.
     """
 
     d: float
@@ -43,6 +48,7 @@ class Degeneracy:
     directions: F8
     eigenvalues: F8
     range_m: float
+    scatter: F8
 
     @property
     def scale(self) -> F8:
@@ -53,10 +59,23 @@ class Degeneracy:
         """Directions (6, k) with p of at least `least_p`, as columns in the unscaled tangent."""
         return self.scale[:, None] * self.directions[:, self.p >= least_p]
 
+    def scan_information(self, least_p: float, inflation: float = 1.0) -> F8:
+        """R^-1 (6, 6) of the registered pose along the observed directions, nothing along the rest; right tangent.
+
+        R = inflation * H^-1 B H^-1 with the scatter B of the gradient: sigma2 H^-1 where residuals are independent.
+        """
+        observed = self.p >= least_p
+        eigenvalues = np.maximum(self.eigenvalues[observed], EIGENVALUE_FLOOR)
+        spread = inflation * self.scatter[np.ix_(observed, observed)]
+        inside = eigenvalues[:, None] * np.linalg.pinv(spread, hermitian=True) * eigenvalues
+        outward = (self.directions / self.scale[:, None])[:, observed]
+        information: F8 = outward @ inside @ outward.T
+        return 0.5 * (information + information.T)
+
 
 def blind() -> Degeneracy:
     """A scan that saw nothing."""
-    return Degeneracy(0.0, BLIND_STD_M, np.zeros(6), np.eye(6), np.zeros(6), 1.0)
+    return Degeneracy(0.0, BLIND_STD_M, np.zeros(6), np.eye(6), np.zeros(6), 1.0, np.zeros((6, 6)))
 
 
 Indicator = Literal["E1", "E2", "E3"]
@@ -100,6 +119,10 @@ def judge(
 
     p_k = Phi((lambda_k / (1 + SNR) - mean_k) / std_k), where mean and std are those of the information that noise of
     points (`point_noise_m`) and of fitted normals alone would give along direction k.
+
+    The scatter is sum_c g_c g_c^T over patches c of the view with g_c = sum w J^T e: residuals of a patch share surfaces
+    of the map and beams that point a little wrong, and are no independent measurements (cluster-robust covariance:
+    Liang and Zeger, Biometrika 73, 1986). A little of sigma2 H is added, for patches whose residuals vanish by chance.
     """
     if len(registration.points) < LEAST_POINTS:
         return blind()
@@ -120,38 +143,44 @@ def judge(
         directions=directions,
         eigenvalues=np.maximum(eigenvalues, 0.0),
         range_m=range_m,
+        scatter=_scatter(registration, scale[:, None] * directions, eigenvalues),
     )
-
-
-def scan_covariance(
-    seen: Degeneracy,
-    sigma2: float,
-    *,
-    inflation: float,
-    floor_m: float,
-    floor_rad: float,
-    predicted: F8,
-    least_p: float,
-) -> F8:
-    """Covariance (6, 6) of a registered motion (methods 1.8), right tangent, order (rotation, translation).
-
-    Well observed directions get inflation * sigma2 / lambda; directions with p below `least_p` were taken from the
-    prediction and get its covariance `predicted` (6, 6); the floors, squared, are added to all.
-    """
-    scale = seen.scale
-    inside = seen.directions.T @ (predicted / scale[:, None] / scale) @ seen.directions
-    strong = seen.p >= least_p
-    inside = np.where(strong[:, None] | strong, 0.0, inside)
-    known = np.where(strong, seen.eigenvalues, np.inf)
-    inside = inside + np.diag(inflation * min(sigma2, BLIND_STD_M**2) / np.maximum(known, EIGENVALUE_FLOOR))
-    covariance = (seen.directions @ inside @ seen.directions.T) * scale[:, None] * scale
-    covariance = covariance + np.diag([floor_rad**2] * 3 + [floor_m**2] * 3)
-    symmetric: F8 = 0.5 * (covariance + covariance.T)
-    return symmetric
 
 
 def _scale(range_m: float) -> F8:
     return np.array([1 / range_m] * 3 + [1.0] * 3)
+
+
+def _scatter(registration: Registration, outward: F8, eigenvalues: F8) -> F8:
+    points = registration.points
+    elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    row = np.floor((elevation + 0.5 * np.pi) / PATCH_RAD[1]).astype(np.int64)
+    column = np.floor((azimuth + np.pi) / PATCH_RAD[0]).astype(np.int64)
+    columns = int(np.ceil(2 * np.pi / PATCH_RAD[0])) + 1
+    patch = row * columns + column
+    weighted = registration.weights * registration.residuals
+    gradients = np.zeros((int(patch.max()) + 1, 6))
+    _add_gradients(points, registration.normals, weighted, patch, gradients)
+    gradients = gradients @ outward
+    sigma2 = min(registration.sigma2, BLIND_STD_M**2)
+    scatter: F8 = gradients.T @ gradients + np.diag(INDEPENDENT_SHARE * sigma2 * np.maximum(eigenvalues, 0.0))
+    return scatter
+
+
+@kernel
+def _add_gradients(points: F8, normals: F8, weighted: F8, patch: I8, gradients: F8) -> None:
+    """Add (p x u, u) w e of every residual to the row of its patch."""
+    for n in range(len(points)):
+        px, py, pz = points[n, 0], points[n, 1], points[n, 2]
+        ux, uy, uz = normals[n, 0], normals[n, 1], normals[n, 2]
+        k, e = patch[n], weighted[n]
+        gradients[k, 0] += e * (py * uz - pz * uy)
+        gradients[k, 1] += e * (pz * ux - px * uz)
+        gradients[k, 2] += e * (px * uy - py * ux)
+        gradients[k, 3] += e * ux
+        gradients[k, 4] += e * uy
+        gradients[k, 5] += e * uz
 
 
 def _translation_information(H: F8) -> float:

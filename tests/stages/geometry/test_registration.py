@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
-from scanloom.stages.geometry.degeneracy import judge, scan_covariance
-from scanloom.stages.geometry.registration import VoxelMap, align
+from scanloom.stages.geometry.degeneracy import (
+    BLIND_STD_M,
+    INDICATORS,
+    PATCH_RAD,
+    blind,
+    indicator,
+    judge,
+)
+from scanloom.stages.geometry.registration import VoxelMap, align, normals_at
 from scanloom.stages.geometry.se3 import F8, inverse, pose, se3_exp, se3_log, so3_exp, transform
 from scanloom.stages.geometry.surfaces import eigen_symmetric_3
 from scanloom.stages.geometry.voxels import downsample
@@ -156,7 +165,68 @@ def test_held_directions_stay_at_the_start() -> None:
     assert np.abs(found.T_target_source[1:3, 3]).max() < 0.01
 
 
-def test_covariance_takes_weak_directions_from_the_prediction() -> None:
+def test_residuals_and_gradient_belong_to_the_result(street_map: VoxelMap) -> None:
+    source = seen_from(street(2), np.eye(4), 5)[::5]
+    found = align(street_map, source, se3_exp([0, 0, 0.01, 0.1, 0, 0]), max_distance_m=1.0, scale_m=0.2)
+    J = np.column_stack((np.cross(found.points, found.normals), found.normals))
+    np.testing.assert_allclose(
+        found.gradient, J.T @ (found.weights * found.residuals), atol=1e-9 * len(J) * np.abs(J).max()
+    )
+    step = np.linalg.solve(found.information, found.gradient)
+    assert np.linalg.norm(step[3:]) < 2e-3
+    inside = np.abs(found.residuals) <= 0.2
+    assert found.rmse_m == pytest.approx(np.sqrt((found.residuals[inside] ** 2).mean()))
+
+
+def test_plane_to_plane_finds_the_motion_too(street_map: VoxelMap) -> None:
+    errors = []
+    for k in range(4):
+        truth = pose(so3_exp([0.01, -0.02, 0.05 * k]), [0.5 * k, 0.3, 0.05])
+        fine = seen_from(street(2), truth, k)
+        source = fine[downsample(fine, 1.0)]
+        normals = normals_at(source, fine, 1.0)
+        lengths = np.linalg.norm(normals, axis=1)
+        assert ((np.abs(lengths - 1) < 1e-6) | (lengths == 0)).all()
+        assert (lengths > 0).mean() > 0.3
+        start = truth @ se3_exp([0.01, 0.01, -0.03, 0.2, -0.2, 0.1])
+        found = align(street_map, source, start, max_distance_m=1.0, scale_m=0.2, source_normals=normals)
+        assert found.converged
+        errors.append(se3_log(inverse(truth) @ found.T_target_source))
+    rotation, translation = np.sqrt((np.array(errors).reshape(-1, 2, 3) ** 2).sum(axis=2).mean(axis=0))
+    assert 0.0003 < translation < 0.02
+    assert 1e-5 < rotation < 2e-3
+
+
+def test_plane_to_plane_with_parallel_normals_is_nearly_point_to_plane(street_map: VoxelMap) -> None:
+    source = seen_from(street(2), np.eye(4), 5)[::5]
+    settings = {"max_distance_m": 1.0, "scale_m": 0.2, "max_iterations": 1}
+    points = align(street_map, source, np.eye(4), **settings)
+    zero = align(street_map, source, np.eye(4), source_normals=np.zeros_like(source), **settings)
+    error = se3_log(inverse(points.T_target_source) @ zero.T_target_source)
+    assert np.abs(error[3:]).max() < 2e-3
+    np.testing.assert_allclose(
+        zero.information, points.information, rtol=0.05, atol=0.02 * np.abs(points.information).max()
+    )
+
+
+def test_what_was_known_before_holds_the_pose_as_firmly_as_it_was_known(street_map: VoxelMap) -> None:
+    truth = np.eye(4)
+    fine = seen_from(street(2), truth, 7)
+    source = fine[downsample(fine, 1.0)]
+    start = se3_exp([0, 0, 0.0, 0.05, 0, 0])
+    left = []
+    for std_m in (1e-5, 2e-3, 10.0):
+        held = np.diag([1.0] * 3 + [std_m**-2] * 3)
+        found = align(street_map, source, start, max_distance_m=1.0, scale_m=0.2, held=held)
+        left.append(found.T_target_source[0, 3])
+    assert left[0] == pytest.approx(0.05, abs=2e-3)
+    assert left[0] > left[1] > left[2]
+    assert abs(left[2]) < 0.015
+    free = align(street_map, source, start, max_distance_m=1.0, scale_m=0.2)
+    assert left[2] == pytest.approx(free.T_target_source[0, 3], abs=1e-3)
+
+
+def test_a_registration_says_how_well_it_knows_each_direction() -> None:
     found = align(
         local_map(tunnel()),
         seen_from(tunnel(), np.eye(4), 1)[::3],
@@ -165,12 +235,49 @@ def test_covariance_takes_weak_directions_from_the_prediction() -> None:
         scale_m=0.1,
     )
     seen = judge(found)
-    predicted = np.diag([0.01**2] * 3 + [0.5**2] * 3)
-    covariance = scan_covariance(
-        seen, found.sigma2, inflation=2.0, floor_m=0.002, floor_rad=1e-4, predicted=predicted, least_p=0.5
-    )  # fmt: skip
-    std = np.sqrt(np.diagonal(covariance))
-    assert 0.45 < std[3] < 0.55
-    assert std[4:].min() >= 0.002
-    assert std[4:].max() < 0.02
-    assert np.linalg.eigvalsh(covariance).min() > 0
+    information = seen.scan_information(0.5)
+    np.testing.assert_array_equal(information, information.T)
+    assert information[3, 3] < 1e-3 * information[4, 4], "nothing along the axis"
+    std = 1 / np.sqrt(np.diagonal(information)[4:])
+    assert (std > 1e-4).all()
+    assert (std < 0.01).all()
+    np.testing.assert_allclose(seen.scan_information(0.5, 4.0), information / 4, rtol=1e-6, atol=1e-3)
+    assert np.abs(blind().scan_information(0.5)).max() == 0
+
+
+def test_correlated_residuals_count_less(street_map: VoxelMap) -> None:
+    """A whole patch of points off by the same amount is no better known than a single such error."""
+    found = align(
+        street_map, seen_from(street(2), np.eye(4), 3)[::3], np.eye(4), max_distance_m=1, scale_m=0.2
+    )
+    rng = np.random.default_rng(0)
+    sigma = float(np.sqrt(found.sigma2))
+    independent = dataclasses.replace(found, residuals=rng.normal(0, sigma, len(found.points)))
+    azimuth = np.arctan2(found.points[:, 1], found.points[:, 0])
+    sector = np.floor(azimuth / PATCH_RAD[0]).astype(int)
+    shared = dataclasses.replace(found, residuals=rng.normal(0, sigma, 99)[sector])
+    mean = [np.trace(judge(r).scatter) for r in (independent, shared)]
+    assert mean[1] > 3 * mean[0]
+    plain = np.trace(np.diag(judge(found).eigenvalues)) * found.sigma2
+    assert 0.3 * plain < mean[0] < 2 * plain
+
+
+def test_the_forms_of_e(street_map: VoxelMap) -> None:
+    source = seen_from(street(2), np.eye(4), 3)[::3]
+    good = align(street_map, source, np.eye(4), max_distance_m=1, scale_m=0.1)
+    stray = align(
+        street_map,
+        source,
+        pose(so3_exp([0, 0, 0.8]), [9, 4, 0]),
+        max_distance_m=1,
+        scale_m=0.1,
+        max_iterations=2,
+    )
+    for kind in INDICATORS:
+        assert 0 < indicator(good, kind) < indicator(stray, kind) <= BLIND_STD_M, kind
+        assert judge(good, kind=kind).e_m == indicator(good, kind)
+    H = np.linalg.inv(good.information)[3:, 3:]
+    assert indicator(good, "E1") == pytest.approx(np.sqrt(good.sigma2 * np.linalg.eigvalsh(H)[-1]), rel=1e-6)
+    assert indicator(good, "E2") == pytest.approx(good.rmse_m / good.inlier_ratio)
+    nothing = align(street_map, np.full((300, 3), 5000.0), np.eye(4), max_distance_m=1, scale_m=0.1)
+    assert {indicator(nothing, kind) for kind in INDICATORS} == {BLIND_STD_M}
