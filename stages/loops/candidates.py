@@ -64,7 +64,10 @@ class CandidateSettings(BaseModel):
 
 @dataclass(frozen=True)
 class Track:
-    """Keyframes of one session with their descriptors."""
+    """Keyframes of one session with their descriptors; of one segment, where odometry lost the motion in between.
+
+    Segments are to each other as sessions are: odometry predicts nothing between them.
+    """
 
     name: str
     scan_index: I8
@@ -95,8 +98,8 @@ class Candidate:
     """Smaller is more promising."""
 
 
-def track_of(name: str, odometry: Odometry, places: Places) -> Track:
-    """Keyframes that have both a pose and a descriptor.
+def tracks_of(name: str, odometry: Odometry, places: Places) -> list[Track]:
+    """Keyframes that have both a pose and a descriptor, segment by segment.
 
     Raises
     ------
@@ -113,14 +116,18 @@ def track_of(name: str, odometry: Odometry, places: Places) -> Track:
     rows = np.array([row[int(s)] for s in places.scan_index], np.int64)
     step = np.linalg.norm(np.diff(odometry.T_odom_lidar[:, :3, 3], axis=0), axis=1)
     travelled = np.concatenate(([0.0], np.cumsum(step)))[: len(odometry)]
-    return Track(
-        name,
-        places.scan_index,
-        odometry.stamp_ns[rows],
-        odometry.T_odom_lidar[rows],
-        travelled[rows],
-        places.descriptor,
-    )
+    parts = [np.flatnonzero(odometry.segment[rows] == s) for s in np.unique(odometry.segment[rows])]
+    return [
+        Track(
+            name,
+            places.scan_index[part],
+            odometry.stamp_ns[rows[part]],
+            odometry.T_odom_lidar[rows[part]],
+            travelled[rows[part]],
+            places.descriptor[part],
+        )
+        for part in parts or [np.zeros(0, np.int64)]
+    ]
 
 
 def candidates(settings: CandidateSettings, tracks: Sequence[Track]) -> list[Candidate]:

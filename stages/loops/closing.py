@@ -12,7 +12,7 @@ from scanloom.schemas.loops import Loops, Places
 from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import Deskewed, Labels
 from scanloom.schemas.trajectory import Odometry
-from scanloom.stages.loops.candidates import Candidate, CandidateSettings, Track, candidates, track_of
+from scanloom.stages.loops.candidates import Candidate, CandidateSettings, Track, candidates, tracks_of
 from scanloom.stages.loops.consistency import ConsistencySettings, inconsistent
 from scanloom.stages.loops.reading import ScanShelf
 from scanloom.stages.loops.submaps import SubmapSettings, SubmapShelf
@@ -77,8 +77,10 @@ def _tracks(
                 where=f"session {name}",
                 next_step="run the whole workflow",
             )
-        tracks.append(track_of(name, track, described[name]))
-        shelves.append(ScanShelf(clouds[name], classes[name]))
+        shelf = ScanShelf(clouds[name], classes[name])
+        for segment in tracks_of(name, track, described[name]):
+            tracks.append(segment)
+            shelves.append(shelf)
     return tracks, shelves
 
 
