@@ -7,12 +7,13 @@ ARGS ?=
 PY := .venv/bin/python
 PACKAGES := schemas stages pipeline workflows
 
-.PHONY: help setup setup-dev map test check format lock nightly docs clean
+.PHONY: help setup setup-dev map test check format lock nightly docs clean bench bench-setup
 
 help:
 	@echo "make map [SESSION=log] [OUT=folder] [ARGS='--set odometry.voxel_size_m=0.4']   logs into a map"
 	@echo "make test     all tests          make check    style, types, import rules"
 	@echo "make nightly FLEET=fleet.yaml    many logs      make setup    only set up .venv"
+	@echo "make bench [ARGS='--data log']   accuracy and speed of odometry against others; their packages: make bench-setup"
 
 setup:
 	@./setup.sh run
@@ -52,3 +53,10 @@ clean:
 
 docs: setup
 	$(PY) -m scanloom.workflows.reference docs
+
+bench: setup
+	@$(PY) -m benchmarks.odometry $(ARGS)
+
+# The systems that the benchmark compares with; they are no part of the product.
+bench-setup: setup
+	@$(PY) -m pip install -q --disable-pip-version-check --no-build-isolation -e '.[bench]'

@@ -142,4 +142,5 @@ def nees(truth: Truth, outcome: Outcome) -> F8:
     found = inverse(estimate[:-1]) @ estimate[1:]
     xi = se3_log(inverse(wanted) @ found)
     C = outcome.extra["covariance"][1:][both]
-    return np.einsum("ni,ni->n", xi, np.linalg.solve(C, xi[:, :, None])[:, :, 0])
+    squares: F8 = np.einsum("ni,ni->n", xi, np.linalg.solve(C, xi[:, :, None])[:, :, 0])
+    return squares

@@ -12,7 +12,7 @@ import resource
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -54,8 +54,8 @@ class Outcome:
     """More of our own system: arrays (n, ...) and figures."""
 
     def write(self, path: Path) -> None:
-        fixed = {"stamp_ns": self.stamp_ns, "T": self.T, "ms": self.ms}
-        np.savez(path, peak_mb=self.peak_mb, threads=self.threads, **fixed, **self.extra)
+        known: dict[str, Any] = {"stamp_ns": self.stamp_ns, "T": self.T, "ms": self.ms}
+        np.savez(path, **known, peak_mb=self.peak_mb, threads=self.threads, **self.extra)
 
     @classmethod
     def read(cls, path: Path) -> Outcome:
@@ -67,9 +67,10 @@ class Outcome:
 
 def run(system: str, recording: Recording, options: dict[str, Any]) -> Outcome:
     """One system, once over one recording, in this process."""
-    return {"scanloom": _scanloom, "kiss_icp": _kiss_icp, "small_gicp": _small_gicp}[system](
-        recording, **options
-    )
+    runners: dict[str, Callable[..., Outcome]] = {
+        "scanloom": _scanloom, "kiss_icp": _kiss_icp, "small_gicp": _small_gicp,
+    }  # fmt: skip
+    return runners[system](recording, **options)
 
 
 def version(system: str) -> str:
@@ -89,7 +90,7 @@ def _scanloom(recording: Recording, timed: bool = True, settings: dict[str, Any]
     """Deskew and odometry. Times are taken with the scans in memory and everything on one core; memory without."""
     from scanloom.stages.odometry import Settings, odometry
 
-    session, imu, wheel = (recording.one(kind) for kind in (Session, Imu, Wheel))
+    session, imu, wheel = recording.one(Session), recording.one(Imu), recording.one(Wheel)
     chosen = Settings(**(settings or {}))
     deskewed, labels = recording.parts(Deskewed), recording.parts(Labels)
     if not timed:
@@ -198,7 +199,9 @@ def _kiss_icp(recording: Recording, deskew: bool = True) -> Outcome:
     config.data.max_range = MAX_RANGE_M
     config.data.deskew = deskew
     system = KissICP(config)
-    stamps, poses, ms = [], [], []
+    stamps: list[int] = []
+    poses: list[F8] = []
+    ms: list[float] = []
     for scan, scenery in scans_without_vehicle(recording, Scans):
         frame, share = scan.points()[scenery].astype(np.float64), _share_of_sweep(scan)[scenery]
         started = time.perf_counter()
@@ -238,7 +241,9 @@ def _small_gicp(recording: Recording, voxel_m: float = 1.0, scans: str = "own") 
     still = MotionTrack.build(Imu.empty(), Wheel.empty(), recording.one(Session))
     local_map, inserted = small_gicp.GaussianVoxelMap(voxel_m), np.full(3, np.inf)
     T, motion, last_ns = np.eye(4), np.eye(4), 0
-    stamps, poses, ms = [], [], []
+    stamps: list[int] = []
+    poses: list[F8] = []
+    ms: list[float] = []
     for scan, scenery in scans_without_vehicle(recording, Scans if scans == "own" else Deskewed):
         points = scan.points()
         if scans == "own" and poses:

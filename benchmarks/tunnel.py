@@ -56,7 +56,10 @@ def axis_flagged(outcome: Outcome, forward: F8, least_p: float) -> NDArray[np.bo
     length = np.linalg.norm(translation, axis=1)
     along = np.abs(translation @ forward) / np.maximum(length, 1e-12)
     mostly_translation = length > np.sqrt(0.5)
-    return (p[rows, weakest] < least_p) & mostly_translation & (along > np.cos(np.radians(WITHIN_DEG)))
+    flagged: NDArray[np.bool_] = (
+        (p[rows, weakest] < least_p) & mostly_translation & (along > np.cos(np.radians(WITHIN_DEG)))
+    )
+    return flagged
 
 
 def flags(truth: Truth, outcome: Outcome, forward: F8, least_p: float) -> tuple[NDArray[np.bool_], Stretch]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from benchmarks.scores import Score
 from scanloom.schemas.scans import Scan, Scans
@@ -28,8 +29,10 @@ def scores(newer: Path | None) -> Iterator[Score]:
     scan = sweep_of_a_wall(twist)
     (flat,) = deskew(Settings(), Scans([scan]), _session(), *sensors(twist))
     how = f"rms distance to a wall {WALL_Y_M:g} m away at {SPEED_M_S:g} m/s and {TURN_DEG_S:g} deg/s, noise {NOISE_M:g} m"
-    yield Score("wall_rms_m", rms(flat.y_m - WALL_Y_M), "m", f"{how}, deskewed with gyro and wheel")
-    yield Score("wall_raw_rms_m", rms(scan.y_m - WALL_Y_M), "m", f"{how}, as measured")
+    yield Score(
+        "wall_rms_m", rms(flat.y_m.astype(np.float64) - WALL_Y_M), "m", f"{how}, deskewed with gyro and wheel"
+    )
+    yield Score("wall_raw_rms_m", rms(scan.y_m.astype(np.float64) - WALL_Y_M), "m", f"{how}, as measured")
     same = scan.points().tobytes() == _at_rest(scan).points().tobytes()
     yield Score("identity_is_exact", float(same), "", "1 when a scan taken at rest comes out bit for bit")
     if newer is not None:
@@ -87,7 +90,8 @@ def range_differences(folder: Path, i: int) -> F8:
     gyro = np.gradient(smooth, middle, axis=0)
     imu = Imu(START_NS + (middle * 1e9).astype(np.int64), gyro, np.tile([0.0, 0.0, 9.81], (SLICES, 1)))
     (flat,) = deskew(Settings(), Scans([scan]), _session(), imu, Wheel.empty())
-    return np.abs(np.linalg.norm(flat.points(), axis=1) - np.linalg.norm(published, axis=1))
+    difference: F8 = np.abs(np.linalg.norm(flat.points(), axis=1) - np.linalg.norm(published, axis=1))
+    return difference
 
 
 def _at_rest(scan: Scan) -> Scan:
@@ -95,9 +99,9 @@ def _at_rest(scan: Scan) -> Scan:
     return out
 
 
-def _scan(points: F8, stamp_ns: np.ndarray, reference_ns: int) -> Scan:
-    n = len(points)
-    x, y, z = (np.ascontiguousarray(column, np.float32) for column in points.T)
+def _scan(points: ArrayLike, stamp_ns: np.ndarray, reference_ns: int) -> Scan:
+    x, y, z = np.ascontiguousarray(np.asarray(points, np.float32).T)
+    n = len(x)
     return Scan(
         stamp_ns=stamp_ns, x_m=x, y_m=y, z_m=z, intensity=np.zeros(n, np.float32), ring=np.zeros(n, np.uint16),
         return_no=np.zeros(n, np.uint8), reference_ns=reference_ns, scan_index=0,
