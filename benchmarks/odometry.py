@@ -14,6 +14,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import subprocess
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -21,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from benchmarks import display, pairs, systems, tunnel, walls
+from benchmarks import display, page, pairs, systems, tunnel, walls
 from benchmarks.comparison import OURS, OWN_SCANS, PEERS, SYSTEMS, Result, Runner, best, ratios
 from benchmarks.scores import Figure, Score
 from benchmarks.sequences import Recording, drives, make
@@ -68,6 +70,7 @@ def _options(words: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--json", default="", help="file for the figures, - for standard output")
     parser.add_argument("--out", type=Path, default=WORK, help="folder for the picture and the figures")
+    parser.add_argument("--page", type=Path, help="a page of the documentation to write the figures into")
     parser.add_argument("--fresh", action="store_true", help="run the peers again")
     options = parser.parse_args(words)
     options.set = {
@@ -169,10 +172,21 @@ def _show(
         print(text)
     else:
         Path(options.json or options.out / "odometry.json").write_text(text + "\n")
+    if options.page:
+        page.fill(options.page, rows, _remark(seconds))
     screen = console if options.json == "-" else Console(width=200)
     screen.print(display.comparison(chosen))
     screen.print(display.summary(figures))
     screen.print(f"picture: {options.out / 'odometry.png'}; {seconds:.0f} s")
+
+
+def _remark(seconds: float) -> str:
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True
+    ).stdout.strip()
+    peers = ", ".join(f"{system} {systems.version(system) or 'not there'}" for system in PEERS)
+    cores = len(os.sched_getaffinity(0))
+    return f"Measured at commit {commit or 'unknown'}, {cores} cores, {peers}; the whole run took {seconds / 60:.1f} minutes."
 
 
 if __name__ == "__main__":
