@@ -17,15 +17,37 @@ from scanloom.pipeline.request import Request, SessionInput
 from scanloom.pipeline.run import Result, run
 from scanloom.pipeline.store import Store
 from scanloom.schemas.product import Parts, Product
-from scanloom.schemas.scans import Deskewed, Labels, Scans
-from scanloom.schemas.session import RawLog, Session, TruthLog
-from scanloom.schemas.tracks import Imu, Wheel
+from scanloom.schemas.scans import Deskewed, Scans
+from scanloom.schemas.session import RawLog, TruthLog
 from scanloom.schemas.trajectory import Truth
 from scanloom.stages.logs.locate import locate
 from scanloom.workflows.map_session import NODES, SIMULATED
 
-STAGES = ("simulate", "truth", "ingest", "deskew", "denoise")
-PRODUCTS: tuple[type[Product], ...] = (Scans, Deskewed, Labels, Session, Imu, Wheel, Truth)
+NODE_OF = {node.name: node for node in NODES}
+WRITER_OF = {product: node for node in NODES for product in node.writes}
+MEASURED = ("deskew", "odometry")
+"""Stages that are run here, on what the engine made."""
+
+
+def _made() -> tuple[type[Product], ...]:
+    """What the measured stages and the comparison read."""
+    read = [product for name in MEASURED for product in NODE_OF[name].reads]
+    return tuple(dict.fromkeys([*read, Truth]))
+
+
+def _makers(wanted: Sequence[type[Product]]) -> set[str]:
+    """Names of the nodes that it takes to make the products, from the log on."""
+    found: set[str] = set()
+    waiting = [*wanted]
+    while waiting:
+        node = WRITER_OF[waiting.pop()]
+        if node.name not in found:
+            found.add(node.name)
+            waiting += node.reads
+    return found
+
+
+PRODUCTS = _made()
 
 ProductT = TypeVar("ProductT", bound=Product)
 Settings = Mapping[str, Any]
@@ -83,6 +105,10 @@ class Recording:
         (path,) = self.files[product.NAME]
         return product.open(Path(path))
 
+    def arguments(self, stage: str, given: Mapping[type[Product], Any]) -> list[Any]:
+        """What a stage is called with after its settings: its products in order, those `given` in place of the files."""
+        return [given[p] if p in given else self.one(p) for p in NODE_OF[stage].reads]
+
 
 def drives(folders: Sequence[Path], names: Sequence[str] = ()) -> list[Drive]:
     """The simulated drives and the folders, those called `names` if any are named."""
@@ -99,7 +125,8 @@ def drives(folders: Sequence[Path], names: Sequence[str] = ()) -> list[Drive]:
 
 def make(chosen: Sequence[Drive], store: Path, *, cluster: str = "local") -> list[Recording]:
     """Run what is missing of simulation, ingest, deskew and denoise; the recordings, in the order of the drives."""
-    nodes = tuple(n for n in NODES if n.name in STAGES)
+    makers = _makers(PRODUCTS)
+    nodes = tuple(n for n in NODES if n.name in makers)
     request = Request(nodes=nodes, sessions=tuple(_session(drive) for drive in chosen))
     result = run(request, Store(store), cluster=cluster if len(chosen) > 1 else "none")
     for task in result.failures:

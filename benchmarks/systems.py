@@ -90,25 +90,26 @@ def _scanloom(recording: Recording, timed: bool = True, settings: dict[str, Any]
     """Deskew and odometry. Times are taken with the scans in memory and everything on one core; memory without."""
     from scanloom.stages.odometry import Settings, odometry
 
-    session, imu, wheel = recording.one(Session), recording.one(Imu), recording.one(Wheel)
     chosen = Settings(**(settings or {}))
     deskewed, labels = recording.parts(Deskewed), recording.parts(Labels)
     if not timed:
         started = time.perf_counter()
-        track = odometry(chosen, deskewed, labels, session, imu, wheel)
+        track = odometry(chosen, *recording.arguments("odometry", {Deskewed: deskewed, Labels: labels}))
         extra = {"whole_ms": 1e3 * (time.perf_counter() - started), **_columns(track)}
         cores = len(os.sched_getaffinity(0))
         return Outcome(track.stamp_ns, track.T_odom_lidar, np.zeros(len(track)), _peak_mb(), cores, extra)
     on_one_core()
     scans, classes = [*_flat(deskewed)], [*_flat(labels)]
-    first = _as_parts(scans[:WARM_UP]), _as_parts(classes[:WARM_UP])
-    odometry(chosen, *first, session, imu, wheel)
+    first = {Deskewed: _as_parts(scans[:WARM_UP]), Labels: _as_parts(classes[:WARM_UP])}
+    odometry(chosen, *recording.arguments("odometry", first))
     clock = Clock()
-    track = odometry(chosen, _as_parts(scans, clock), _as_parts(classes), session, imu, wheel)
+    given = recording.arguments("odometry", {Deskewed: _as_parts(scans, clock), Labels: _as_parts(classes)})
+    clock.start()
+    track = odometry(chosen, *given)
     ms = clock.per_frame(len(track))
     extra = {
-        "deskew_ms": _deskew_ms(recording, session, imu, wheel),
-        "deskew_io_ms": _deskew_files_ms(recording, session, imu, wheel), **_columns(track),
+        "deskew_ms": _deskew_ms(recording),
+        "deskew_io_ms": _deskew_files_ms(recording), **_columns(track),
     }  # fmt: skip
     return Outcome(track.stamp_ns, track.T_odom_lidar, ms, float("nan"), 1, extra)
 
@@ -123,6 +124,10 @@ class Clock:
 
     def __init__(self) -> None:
         self.ticks: list[float] = []
+        self.start()
+
+    def start(self) -> None:
+        """Begin to count."""
         self.started = time.perf_counter()
 
     def per_frame(self, frames: int) -> F8:
@@ -153,31 +158,33 @@ def _as_parts(items: list[Any], clock: Clock | None = None) -> Parts[Any]:
     return Parts([((("session", "a"), ("chunk", "0000")), kind(noting()))])
 
 
-def _deskew_ms(recording: Recording, session: Session, imu: Imu, wheel: Wheel) -> F8:
+def _deskew_ms(recording: Recording) -> F8:
     """(n,) ms of deskewing each scan, scans in memory, on one core."""
     from scanloom.stages.deskew import Settings, deskew
 
     ms: list[float] = []
     for part in recording.parts(Scans):
         scans = [*part]
-        for _ in zip(range(2), deskew(Settings(), Scans(scans), session, imu, wheel)):
+        for _ in zip(range(2), deskew(Settings(), *recording.arguments("deskew", {Scans: Scans(scans)}))):
             pass  # compiled code is loaded
+        given = recording.arguments("deskew", {Scans: Scans(scans)})
         started = time.perf_counter()
-        for _ in deskew(Settings(), Scans(scans), session, imu, wheel):
+        for _ in deskew(Settings(), *given):
             now = time.perf_counter()
             ms.append(1e3 * (now - started))
             started = now
     return np.array(ms)
 
 
-def _deskew_files_ms(recording: Recording, session: Session, imu: Imu, wheel: Wheel) -> float:
+def _deskew_files_ms(recording: Recording) -> float:
     """Mean ms per scan of deskewing from files to files, on one core."""
     from scanloom.stages.deskew import Settings, deskew
 
     with tempfile.TemporaryDirectory() as folder:
         started, scans = time.perf_counter(), 0
         for part in recording.parts(Scans):
-            scans += deskew(Settings(), part, session, imu, wheel).write(Path(folder) / "deskewed.parquet")
+            flat = deskew(Settings(), *recording.arguments("deskew", {Scans: part}))
+            scans += flat.write(Path(folder) / "deskewed.parquet")
         return 1e3 * (time.perf_counter() - started) / scans
 
 
