@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -17,8 +18,9 @@ import numpy as np
 
 from benchmarks import reference, scores, systems
 from benchmarks.scores import Score
-from benchmarks.sequences import Recording
+from benchmarks.sequences import MEASURED, NODE_OF, Recording
 from benchmarks.systems import Outcome
+from scanloom.pipeline.fingerprint import code_version, digest
 from scanloom.schemas.trajectory import Truth
 
 OURS = "scanloom"
@@ -74,20 +76,20 @@ class Runner:
         return reference.kept(recording, rough.T, self.folder), own
 
     def outcome(self, system: str, recording: Recording, options: Options) -> Outcome:
-        """What a system says; a peer's earlier word is taken when the peer and its input are the same."""
+        """What a system says; its earlier word is taken when the system and its input are the same."""
         if system == OURS:
             options = {**options, "settings": {**self.settings, **options.get("settings", {})}}
-        words = "-".join(f"{k}={v}" for k, v in sorted(options.items()))
-        digest = recording.deskewed_digest if options.get("scans") == "ours" else recording.digest
-        name = "_".join((recording.name, system, systems.version(system), words, digest))
+        words = re.sub(r"[^\w.=,-]+", "", "-".join(f"{k}={v}" for k, v in sorted(options.items())))
+        name = "_".join(
+            (recording.name, system, systems.version(system), words, _digest(system, recording, options))
+        )
         kept = self.folder / f"{name}.npz"
-        if system in PEERS and kept.exists() and not self.fresh:
+        if kept.exists() and not self.fresh:
             return Outcome.read(kept)
         self.folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=self.folder) as folder:
             outcome = _run(system, recording, options, Path(folder))
-            if system in PEERS:
-                (Path(folder) / "out.npz").replace(kept)
+            (Path(folder) / "out.npz").replace(kept)
         return outcome
 
     def results(self, system: str, recording: Recording) -> list[Result]:
@@ -122,6 +124,14 @@ class Runner:
         yield Score("ms_per_frame_pipeline", whole, "ms", "mean, reading included, all cores")
         yield from scores.deskewing(outcome)
         yield from scores.candour(truth, outcome)
+
+
+def _digest(system: str, recording: Recording, options: Options) -> str:
+    """Of what a system reads; of our own also of its code."""
+    if system != OURS:
+        return recording.deskewed_digest if options.get("scans") == "ours" else recording.digest
+    code = [code_version(NODE_OF[stage].stage, 0) for stage in MEASURED]
+    return digest([code, recording.made_digest])[:16]
 
 
 def _run(system: str, recording: Recording, options: Options, folder: Path) -> Outcome:

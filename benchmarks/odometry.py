@@ -6,8 +6,8 @@
     python -m benchmarks.odometry --data FOLDER --json -                     one more log, figures as JSON
     python -m benchmarks.odometry --set voxel_size_m=0.5                     ours with another setting
 
-What the peers say of a sequence is kept (build/bench/results) until the peer's version or the sequence changes, so a
-change of ours is measured against it in seconds; `--fresh` runs them again, which times need to be comparable.
+What a system says of a sequence is kept (build/bench/results) until its version (of ours: its code) or the sequence
+changes, so a change of ours is measured in seconds. `--fresh` runs all of them again, so that times are of one run.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def _options(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--json", default="", help="file for the figures, - for standard output")
     parser.add_argument("--out", type=Path, default=WORK, help="folder for the picture and the figures")
     parser.add_argument("--page", type=Path, help="a page of the documentation to write the figures into")
-    parser.add_argument("--fresh", action="store_true", help="run the peers again")
+    parser.add_argument("--fresh", action="store_true", help="run every system again")
     options = parser.parse_args(words)
     options.set = {
         name: json.loads(value) for name, _, value in (word.partition("=") for word in options.set)

@@ -87,6 +87,8 @@ class Recording:
     """Of raw scans and truth: what systems say that read nothing else is kept under it."""
     deskewed_digest: str
     """The same with the deskewed scans."""
+    made_digest: str
+    """Of everything that our stages read."""
 
     def __len__(self) -> int:
         """Number of scans."""
@@ -149,8 +151,10 @@ def _sequence(drive: Drive, result: Result) -> Recording:
         ]
         for product in PRODUCTS
     }
-    raw, deskewed = _digest(drive, result, Scans, Truth), _digest(drive, result, Scans, Truth, Deskewed)
-    return Recording(drive.name, drive.title, drive.folder is None, files, raw, deskewed)
+    digests = (
+        _digest(drive, result, *products) for products in ((Scans, Truth), (Scans, Truth, Deskewed), PRODUCTS)
+    )
+    return Recording(drive.name, drive.title, drive.folder is None, files, *digests)
 
 
 def _digest(drive: Drive, result: Result, *products: type[Product]) -> str:
