@@ -70,10 +70,10 @@ class Runner:
     def truth(self, recording: Recording) -> tuple[Truth, Truth | None]:
         """Truth for errors over short stretches, and the log's own where it is too coarse for that."""
         own = recording.one(Truth)
-        if recording.simulated or (len(own) and not own.source.startswith("OXTS")):
+        if len(own) and not own.source.startswith("OXTS"):
             return own, None
         rough = self.outcome("small_gicp", recording, VARIANTS["small_gicp"]["own_1m"])
-        return reference.kept(recording, rough.T, self.folder), own
+        return reference.kept(recording, rough.T, self.folder), own if len(own) else None
 
     def outcome(self, system: str, recording: Recording, options: Options) -> Outcome:
         """What a system says; its earlier word is taken when the system and its input are the same."""
