@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,19 +100,23 @@ class Rows:
 
     def table(self) -> Odometry:
         """The product."""
-        rows = self.rows
-        return Odometry(
-            scan_index=np.array([r.scan_index for r in rows], np.int64),
-            stamp_ns=np.array([r.stamp_ns for r in rows], np.int64),
-            T_odom_lidar=np.array([r.T_odom_lidar for r in rows]),
-            covariance=np.array([r.covariance for r in rows]),
-            inlier_ratio=np.array([r.inlier_ratio for r in rows]),
-            rmse_m=np.array([r.rmse_m for r in rows]),
-            degeneracy_d=np.array([r.seen.d for r in rows]),
-            degeneracy_e=np.array([r.seen.e_m for r in rows]),
-            direction_p=np.array([r.seen.p for r in rows]),
-            weak_directions=np.array([r.seen.directions for r in rows]),
-            keyframe=np.array([r.keyframe for r in rows]),
-            reliable=np.array([r.reliable for r in rows]),
-            segment=np.array([r.segment for r in rows], np.int32),
-        )
+        return table(self.rows)
+
+
+def table(rows: Sequence[Row]) -> Odometry:
+    """The product of these rows."""
+    return Odometry(
+        scan_index=np.array([r.scan_index for r in rows], np.int64),
+        stamp_ns=np.array([r.stamp_ns for r in rows], np.int64),
+        T_odom_lidar=np.array([r.T_odom_lidar for r in rows]),
+        covariance=np.array([r.covariance for r in rows]),
+        inlier_ratio=np.array([r.inlier_ratio for r in rows]),
+        rmse_m=np.array([r.rmse_m for r in rows]),
+        degeneracy_d=np.array([r.seen.d for r in rows]),
+        degeneracy_e=np.array([r.seen.e_m for r in rows]),
+        direction_p=np.array([r.seen.p for r in rows]),
+        weak_directions=np.array([r.seen.directions for r in rows]),
+        keyframe=np.array([r.keyframe for r in rows]),
+        reliable=np.array([r.reliable for r in rows]),
+        segment=np.array([r.segment for r in rows], np.int32),
+    )

@@ -1,0 +1,155 @@
+"""Windows: the same log cut or not gives the same trajectory within the covariance, and the same bytes every time."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from scanloom.schemas.product import columns_of
+from scanloom.schemas.scans import DeskewedScan
+from scanloom.schemas.trajectory import Odometry
+from scanloom.stages.geometry.se3 import F8, inverse, se3_log
+from scanloom.stages.odometry import Settings
+from scanloom.stages.odometry.windows import Window, cut, scans_of
+from tests.stages.odometry.drives import Drive, drive_along, labelled, parts, step_errors
+from tests.worlds import street
+
+CUT = Settings(windows=3, window_overlap_s=1.0)
+SEEDS = (2, 7)
+
+
+def times(count: int) -> np.ndarray:
+    return 10**18 + 100_000_000 * np.arange(count)
+
+
+def test_windows_reach_back_and_own_every_scan_once() -> None:
+    assert cut(times(90), 3, 1.0) == [Window(0, 0, 30), Window(20, 30, 60), Window(50, 60, 90)]
+
+
+def test_a_session_too_short_for_its_overlaps_has_fewer_windows() -> None:
+    assert cut(times(90), 1, 1.0) == [Window(0, 0, 90)]
+    assert len(cut(times(81), 4, 1.0)) == 4
+    assert len(cut(times(80), 4, 1.0)) == 3
+    assert cut(times(20), 4, 1.0) == [Window(0, 0, 20)]
+    assert len(cut(times(0), 4, 1.0)) == 1
+
+
+def test_a_window_reaches_back_over_a_pause_but_not_beyond_the_window_before() -> None:
+    stamps = times(60)
+    stamps[30:] += 10**10
+    assert cut(stamps, 2, 1.0) == [Window(0, 0, 30), Window(20, 30, 60)]
+    crowded = np.concatenate((times(10) - 10**12, times(50)[:40] // 10 + 9 * 10**17, times(50)[40:]))
+    assert all(b.first >= a.own for a, b in itertools.pairwise(cut(crowded, 3, 300.0)))
+
+
+def test_scans_of_a_window_come_from_all_chunks_it_touches() -> None:
+    ride = drive_along(street(2), 12)
+    clouds, classes = parts(ride.scans, 5), parts([labelled(s) for s in ride.scans], 5)
+    for first, last in ((0, 12), (3, 7), (5, 10), (9, 12)):
+        found = [s.scan_index for s, _ in scans_of(clouds, classes, Window(first, first, last), "a")]
+        assert found == list(range(first, last))
+
+
+def test_bounds_of_the_settings() -> None:
+    Settings(windows=64, window_overlap_s=300.0)
+    for wrong in ({"windows": 65}, {"windows": -1}, {"window_overlap_s": 0.5}):
+        with pytest.raises(ValidationError):
+            Settings(**wrong)
+
+
+@pytest.fixture(scope="module")
+def rides() -> list[Drive]:
+    return [drive_along(street(seed), 66, seed=seed) for seed in SEEDS]
+
+
+@pytest.fixture(scope="module")
+def whole(rides: list[Drive]) -> list[Odometry]:
+    return [ride.run() for ride in rides]
+
+
+@pytest.fixture(scope="module")
+def joined(rides: list[Drive]) -> list[Odometry]:
+    return [ride.run(CUT) for ride in rides]
+
+
+def seams(track: Odometry) -> list[int]:
+    return [w.own for w in cut(track.stamp_ns, CUT.windows, CUT.window_overlap_s)[1:]]
+
+
+def differences(a: Odometry, b: Odometry) -> F8:
+    """Of the motions between scans, (n - 1, 6)."""
+    steps = [inverse(t.T_odom_lidar[:-1]) @ t.T_odom_lidar[1:] for t in (a, b)]
+    return se3_log(inverse(steps[0]) @ steps[1])
+
+
+def test_the_first_window_is_the_whole_run_until_the_first_seam(
+    whole: list[Odometry], joined: list[Odometry]
+) -> None:
+    for a, b in zip(whole, joined, strict=True):
+        np.testing.assert_array_equal(a.T_odom_lidar[: seams(b)[0]], b.T_odom_lidar[: seams(b)[0]])
+        np.testing.assert_array_equal(a.scan_index, b.scan_index)
+        np.testing.assert_array_equal(a.stamp_ns, b.stamp_ns)
+        assert b.reliable.all()
+        assert not b.segment.any()
+
+
+def test_seams_agree_with_the_whole_run_within_the_covariance(
+    whole: list[Odometry], joined: list[Odometry]
+) -> None:
+    """Six degrees of freedom at four seams: mean chi-square of the difference is at most that of two independent
+    measurements, and more than nothing, since the seam is another estimate."""
+    square = []
+    for a, b in zip(whole, joined, strict=True):
+        off = differences(a, b)
+        square += [off[k - 1] @ np.linalg.solve(b.covariance[k], off[k - 1]) for k in seams(b)]
+    assert 0.05 < np.mean(square) < 12
+    assert max(square) < 35
+
+
+def test_seams_are_as_wrong_as_their_covariance_says(rides: list[Drive], joined: list[Odometry]) -> None:
+    square = []
+    for ride, b in zip(rides, joined, strict=True):
+        errors = step_errors(b, ride.truth)
+        square += [errors[k - 1] @ np.linalg.solve(b.covariance[k], errors[k - 1]) for k in seams(b)]
+    assert 0.6 < np.mean(square) < 18, "6 is perfect, below is cautious"
+
+
+def test_ends_agree(rides: list[Drive], whole: list[Odometry], joined: list[Odometry]) -> None:
+    for a, b in zip(whole, joined, strict=True):
+        apart = np.linalg.norm((a.T_odom_lidar[-1] - b.T_odom_lidar[-1])[:3, 3])
+        assert 1e-6 < apart < 0.1
+
+
+def test_cut_runs_are_the_same_bytes_however_threads_take_turns(
+    rides: list[Drive], joined: list[Odometry]
+) -> None:
+    again = rides[0].run(CUT, chunk=7)
+    for name in columns_of(Odometry):
+        assert getattr(again, name).tobytes() == getattr(joined[0], name).tobytes(), name
+
+
+def test_one_window_is_the_uncut_run(rides: list[Drive], whole: list[Odometry]) -> None:
+    for settings in (Settings(windows=1), Settings(windows=4, window_overlap_s=60.0)):
+        track = rides[0].run(settings)
+        for name in columns_of(Odometry):
+            assert getattr(track, name).tobytes() == getattr(whole[0], name).tobytes(), name
+
+
+def test_windows_without_a_common_scan_become_segments(rides: list[Drive]) -> None:
+    """No scan of the overlap was registered in both windows: what lies between them is said to be unknown."""
+    ride = rides[0]
+    blind = [
+        dataclasses.replace(s, **{name: getattr(s, name)[:0] for name in columns_of(DeskewedScan)})
+        for s in ride.scans[12:22]
+    ]
+    ride = dataclasses.replace(ride, scans=ride.scans[:12] + blind + ride.scans[22:44], truth=ride.truth[:44])
+    track = ride.run(Settings(windows=2, window_overlap_s=1.0), sensors=False)
+    border = np.flatnonzero(np.diff(track.segment)) + 1
+    assert 22 in border
+    assert not track.reliable[22]
+    assert track.keyframe[21:23].all()
+    assert np.sqrt(track.covariance[22, 3, 3]) > 5
