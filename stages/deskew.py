@@ -13,12 +13,14 @@ from typing import Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Scan, Scans
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.stages.geometry.compensation import compensate
 from scanloom.stages.geometry.motion import MotionTrack, Twists
 from scanloom.stages.geometry.neighbours import ThinScan, twist_between
+from scanloom.stages.geometry.rig import corrected
 from scanloom.stages.geometry.se3 import F8
 
 VERSION = 1
@@ -47,14 +49,22 @@ class Settings(BaseModel):
     )
 
 
-def deskew(settings: Settings, scans: Scans, session: Session, imu: Imu, wheel: Wheel) -> Deskewed:
+def deskew(
+    settings: Settings,
+    scans: Scans,
+    session: Session,
+    imu: Imu,
+    wheel: Wheel,
+    check: SensorCheck | None = None,
+) -> Deskewed:
     """The scans of a chunk with all points in the LiDAR frame at each scan's `reference_ns`, m; same points and order.
 
     Scans are read, compensated and handed on one by one; at most two are held. A scan whose points carry no time of
     their own, or whose motion is not known, passes unchanged; without motion the coordinates are the same bits.
+    `check` corrects IMU and wheels first.
     """
     track = MotionTrack.build(
-        imu, wheel, session, wheel_scale=settings.wheel_scale,
+        *corrected(imu, wheel, check), session, wheel_scale=settings.wheel_scale,
         max_gyro_gap_s=settings.max_gyro_gap_s, max_wheel_gap_s=settings.max_wheel_gap_s,
     )  # fmt: skip
     if settings.motion == "none" or session.point_time == "none":

@@ -6,6 +6,7 @@ from scanloom.pipeline.node import Node, node
 from scanloom.schemas.evaluation import ErrorTrack, Metrics, ReportFiles
 from scanloom.schemas.loops import Loops, Places
 from scanloom.schemas.pose_graph import Graph
+from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.scans import Deskewed, Labels, Scans
 from scanloom.schemas.session import RawLog, Session, TruthLog
 from scanloom.schemas.tiles import MapFiles, Piece, Tile, TileFiles, TileIndex
@@ -20,6 +21,7 @@ from scanloom.stages.loops.closing import loops
 from scanloom.stages.loops.places import places
 from scanloom.stages.odometry import odometry
 from scanloom.stages.report import report
+from scanloom.stages.sensors import sensors
 from scanloom.stages.simulate import simulate
 from scanloom.stages.tiling import overview, tiles, tiling
 from scanloom.stages.truth import truth
@@ -32,9 +34,10 @@ NODES: tuple[Node, ...] = (
     node("simulate",   simulate,   per="session", reads=(),                                    writes=(RawLog, TruthLog), only=SIMULATED),
     node("truth",      truth,      per="session", reads=(TruthLog,),                           writes=Truth),
     node("ingest",     ingest,     per="session", reads=(RawLog,),                             writes=(Scans, Imu, Gnss, Wheel, Session)),
-    node("deskew",     deskew,     per="chunk",   reads=(Scans, Session, Imu, Wheel),          writes=Deskewed),
+    node("sensors",    sensors,    per="session", reads=(Scans, Session, Imu, Wheel),          writes=SensorCheck),
+    node("deskew",     deskew,     per="chunk",   reads=(Scans, Session, Imu, Wheel, SensorCheck), writes=Deskewed),
     node("denoise",    denoise,    per="chunk",   reads=(Deskewed, Session),                   writes=Labels),
-    node("odometry",   odometry,   per="session", reads=(Deskewed, Labels, Session, Imu, Wheel), writes=Odometry),
+    node("odometry",   odometry,   per="session", reads=(Deskewed, Labels, Session, Imu, Wheel, SensorCheck), writes=Odometry),
     node("places",     places,     per="session", reads=(Deskewed, Labels, Odometry),          writes=Places),
     node("loops",      loops,      per="map",     reads=(Deskewed, Labels, Odometry, Places),  writes=Loops),
     node("fusion",     fusion,     per="map",     reads=(Session, Odometry, Loops, Gnss, Imu), writes=(Poses, Graph)),

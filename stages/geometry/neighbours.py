@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from scanloom.schemas.scans import Scan
 from scanloom.stages.geometry.compensation import compensate
+from scanloom.stages.geometry.degeneracy import translation_information
 from scanloom.stages.geometry.motion import MotionTrack
 from scanloom.stages.geometry.registration import Registration, VoxelMap, align
 from scanloom.stages.geometry.se3 import F8, se3_log
@@ -34,6 +35,9 @@ SETTLED_M_S = 1.0  # a guess wrong by this leaves an error of about 2 % of it
 SETTLED_RAD_S = 0.1
 LEAST_INLIERS = 60
 LEAST_INLIER_SHARE = 0.6  # of the points that have a partner; scans that do not belong together reach 0.4
+LEAST_INFORMATION = (
+    0.03  # D; streets have 0.05 and more, tunnels and fields 0.02 and less, and errors of 10 m/s
+)
 LONGEST_PAUSE_S = 0.5
 FASTEST_M_S = 70.0
 FASTEST_RAD_S = 12.0
@@ -147,8 +151,11 @@ def _compensated(points: Points, reference_ns: int, track: MotionTrack, twist: F
 
 
 def _fits(found: Registration, tried: int) -> bool:
+    """Whether the scans belong together and say so in every direction: on a bare field the rings on the ground always
+    fit best when nothing moves."""
     inliers = found.inlier_ratio * tried
-    return inliers >= LEAST_INLIERS and inliers >= LEAST_INLIER_SHARE * len(found.points)
+    enough = inliers >= LEAST_INLIERS and inliers >= LEAST_INLIER_SHARE * len(found.points)
+    return enough and translation_information(found) >= LEAST_INFORMATION
 
 
 def _settled(change: F8) -> bool:

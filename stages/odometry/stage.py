@@ -9,11 +9,13 @@ import numpy as np
 
 from scanloom.schemas.errors import StageError
 from scanloom.schemas.product import Parts
+from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.scans import Deskewed, Labels
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.geometry.lookahead import ahead
+from scanloom.stages.geometry.rig import corrected
 from scanloom.stages.odometry.joining import Tracked, join
 from scanloom.stages.odometry.prediction import Predictor
 from scanloom.stages.odometry.rows import table
@@ -37,12 +39,14 @@ def odometry(
     session: Session,
     imu: Imu,
     wheel: Wheel,
+    check: SensorCheck | None = None,
 ) -> Odometry:
     """Pose of the LiDAR at every scan of one session, in a frame `odom` that is the first scan's LiDAR frame.
 
     `odom` is not levelled: the first pose is exactly identity, whatever the IMU says of gravity. Motion is predicted
     from gyro and wheels where present, corrected by the scan in the directions it observes, and bridged by prediction
-    alone (`reliable` false) where registration failed or the scan is empty. Every scan gets a row.
+    alone (`reliable` false) where registration failed or the scan is empty. Every scan gets a row. `check` corrects IMU
+    and wheels first.
 
     With `settings.windows` above 1, stretches of the session are tracked at the same time and joined over their overlaps
     (see `joining`); the outcome does not depend on how the threads take turns.
@@ -51,6 +55,7 @@ def odometry(
     ------
     StageError : fewer than two scans, stamps that do not increase, or labels that do not belong to the scans.
     """
+    imu, wheel = corrected(imu, wheel, check)
     windows = (
         cut(stamps(deskewed), settings.windows, settings.window_overlap_s) if settings.windows > 1 else []
     )

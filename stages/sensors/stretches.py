@@ -1,0 +1,94 @@
+"""Short stretches of a session in which its sensors have most to say, and the motion between the scans there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanloom.schemas.scans import Scan, Scans
+from scanloom.stages.geometry.motion import I8, MotionTrack
+from scanloom.stages.geometry.neighbours import ThinScan, twist_between
+from scanloom.stages.geometry.se3 import F8
+
+STRETCH = 12
+"""Pairs of scans in a row."""
+LEAST_READINGS = 8
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a scan lies: part of the session, number in the part, its reference time, its points."""
+
+    part: int
+    number: int
+    reference_ns: int
+    points: int
+
+
+@dataclass(frozen=True)
+class Motions:
+    """Mean twists (m, 6) of the LiDAR between scans, and the reference times of the two (m,)."""
+
+    start_ns: I8
+    end_ns: I8
+    twist: F8
+
+
+def places(scans: Sequence[Scans]) -> list[Place]:
+    """All scans of a session in order, without reading a point."""
+    return [
+        Place(k, i, int(entry["reference_ns"]), int(entry["rows"]))
+        for k, part in enumerate(scans)
+        for i, entry in enumerate(part.index)
+    ]
+
+
+def liveliest(reference_ns: I8, stamp_ns: I8, value: F8, count: int, taken: set[int]) -> list[int]:
+    """First scans of `count` stretches in which the readings (n, c) vary most, apart from those in `taken`."""
+    starts = np.arange(0, max(len(reference_ns) - STRETCH, 1), STRETCH // 2)
+    last = np.minimum(starts + STRETCH, len(reference_ns) - 1)
+    i, j = np.searchsorted(stamp_ns, reference_ns[starts]), np.searchsorted(stamp_ns, reference_ns[last])
+    spread = np.array([_spread(value[a:b]) for a, b in zip(i, j, strict=True)])
+    found: list[int] = []
+    for k in np.argsort(-spread, kind="stable"):
+        start = int(starts[k])
+        if len(found) < count and spread[k] > 0 and all(abs(start - t) >= STRETCH for t in taken):
+            taken.add(start)
+            found.append(start)
+    return found
+
+
+def motions(scans: Sequence[Scans], where: list[Place], starts: list[int], track: MotionTrack) -> Motions:
+    """Register the neighbours of each stretch, two stretches at a time; pairs that do not fit are left out."""
+    stretches = [where[start : start + STRETCH + 1] for start in sorted(starts)]
+    with ThreadPoolExecutor(2, thread_name_prefix="stretch") as threads:
+        found = threads.map(lambda stretch: _stretch(scans, stretch, track), stretches)
+        rows = [row for stretch in found for row in stretch]
+    return Motions(
+        np.array([r[0] for r in rows], np.int64),
+        np.array([r[1] for r in rows], np.int64),
+        np.array([r[2] for r in rows], float).reshape(-1, 6),
+    )
+
+
+def _stretch(scans: Sequence[Scans], where: list[Place], track: MotionTrack) -> list[tuple[int, int, F8]]:
+    rows: list[tuple[int, int, F8]] = []
+    before: ThinScan | None = None
+    guess: F8 | None = None
+    for place in where:
+        scan: Scan = scans[place.part][place.number]
+        thin = ThinScan.of(scan)
+        if before is not None:
+            guess = twist_between(before, thin, track, guess)
+            if guess is not None:
+                rows.append((before.reference_ns, thin.reference_ns, guess))
+        before = thin
+    return rows
+
+
+def _spread(value: F8) -> float:
+    """Standard deviation of all columns together, m or rad per s; zero where there is hardly a reading."""
+    return float(np.sqrt(value.var(axis=0).sum())) if len(value) >= LEAST_READINGS else 0.0
