@@ -186,9 +186,7 @@ def _error_ratios(
     values = [value for value, _ in found.values()]
     simulated = [value for value, made in found.values() if made]
     how = f"ours over {peer}, error over 10 m, {which}"
-    yield Score(
-        f"ratio.{peer}{suffix}", float(np.mean(values)), "", f"mean over {len(values)} sequences: {how}"
-    )
+    yield Score(f"ratio.{peer}{suffix}", float(np.mean(values)), "", f"mean over {_count(values)}: {how}")
     yield Score(f"ratio.{peer}{suffix}.worst", float(max(values)), "", f"largest: {how}")
     if simulated:
         yield Score(
@@ -211,5 +209,9 @@ def _time_ratios(chosen: Mapping[tuple[str, str], Result], sequences: Sequence[s
         return
     for name, values in (("time_ratio.odometry", odometry), ("time_ratio.with_deskew", both)):
         how = "ours on one core over KISS-ICP with all its threads, mean time per frame"
-        yield Score(name, float(np.mean(values)), "", f"mean over {len(values)} sequences: {how}")
+        yield Score(name, float(np.mean(values)), "", f"mean over {_count(values)}: {how}")
         yield Score(f"{name}.worst", float(max(values)), "", f"largest: {how}")
+
+
+def _count(values: Sequence[float]) -> str:
+    return f"{len(values)} sequence{'s' if len(values) > 1 else ''}"
