@@ -42,7 +42,7 @@ class VoxelMap:
         points_per_voxel: int = 20,
         *,
         surface_radius_m: float | None = None,
-        refit_after: int = 5,
+        refit_after: int = 20,
     ) -> None:
         self.voxel_size_m = float(voxel_size_m)
         self.points_per_voxel = int(points_per_voxel)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict, Field
+
+from scanloom.stages.geometry.degeneracy import Indicator
 
 
 class Settings(BaseModel):
@@ -15,6 +19,18 @@ class Settings(BaseModel):
     )
     points_per_voxel: int = Field(
         20, ge=4, le=100, description="most points kept in a voxel of the local map"
+    )
+    dense_voxel_size_m: float = Field(
+        0.7, ge=0.1, le=5.0, description="the same where scans are dense enough for surfaces of this size, m"
+    )
+    dense_source_voxel_m: float = Field(
+        0.85, ge=0.05, le=10.0, description="what dense scans are thinned to before they are registered, m"
+    )
+    dense_share: float = Field(
+        0.145,
+        ge=0.0,
+        le=1.0,
+        description="scans are dense when of the first one's points this share lies on a surface of the dense voxel's size",
     )
     map_spacing_m: float = Field(
         0.4, ge=0.02, le=5.0, description="scans are thinned to this before they enter the map, m"
@@ -75,6 +91,13 @@ class Settings(BaseModel):
         ge=0.0,
         le=1e4,
         description="the same where gyro and wheels tell the motion and a scan would overrule them",
+    )
+    indicator: Indicator = Field(
+        "E1",
+        description="form of E: worst deviation of translation (E1), rmse over inlier ratio (E2), E1 over inlier ratio (E3)",
+    )
+    residual: Literal["point_to_plane", "plane_to_plane"] = Field(
+        "point_to_plane", description="what registration minimises"
     )
     point_noise_m: float = Field(0.02, ge=0.001, le=1.0, description="noise of a point, m")
     covariance_inflation: float = Field(

@@ -9,10 +9,13 @@ from numpy.typing import NDArray
 
 from scanloom.schemas.scans import DeskewedScan, PointClass, ScanLabels
 from scanloom.stages.geometry.kernels import kernel
+from scanloom.stages.geometry.registration import normals_at
 from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.geometry.voxels import EMPTY, Float, Int, downsample, find_slot, key_of, table_length
 from scanloom.stages.odometry.settings import Settings
 
+LEAST_TO_JUDGE, DENSE_POINTS = 500, 8000
+"""Points of a thinned scan: fewer say nothing of the sensor; a sensor near walls has surfaces with fewer, too."""
 USED = (PointClass.UNLABELLED, PointClass.GROUND, PointClass.STATIC)
 USED_CLASS = np.isin(np.arange(256), USED)
 
@@ -25,16 +28,43 @@ class ThinScan:
     stamp_ns: int
     fine: F8
     coarse: F8
+    voxel_size_m: float
+    """Of the map that suits these scans."""
+    normals: F8 | None = None
+    """(m, 3) of the surfaces through `coarse`, zero where there is none; only for plane to plane."""
 
 
-def thin(settings: Settings, scan: DeskewedScan, labels: ScanLabels) -> ThinScan:
-    """Of the points that may be part of the static world, the first in each voxel."""
-    fine = _first_used(
-        scan.x_m, scan.y_m, scan.z_m, labels.class_, USED_CLASS, 1.0 / settings.map_spacing_m,
-        table_length(len(scan)),
-    )  # fmt: skip
-    coarse = fine[downsample(fine, settings.source_voxel_m)]
-    return ThinScan(scan.scan_index, scan.reference_ns, fine, coarse)
+class Thinner:
+    """Thins the scans of a session alike. How finely the first scan tells, the one with enough points to judge by."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._dense: bool | None = None
+
+    def thin(self, scan: DeskewedScan, labels: ScanLabels) -> ThinScan:
+        """Of the points that may be part of the static world, the first in each voxel."""
+        chosen = self._settings
+        fine = _first_used(
+            scan.x_m, scan.y_m, scan.z_m, labels.class_, USED_CLASS, 1.0 / chosen.map_spacing_m,
+            table_length(len(scan)),
+        )  # fmt: skip
+        if self._dense is None and len(fine) >= LEAST_TO_JUDGE:
+            self._dense = len(fine) >= DENSE_POINTS and (
+                surface_share(fine, chosen.dense_voxel_size_m) >= chosen.dense_share
+            )
+        voxel_m, source_m = chosen.voxel_size_m, chosen.source_voxel_m
+        if self._dense:
+            voxel_m, source_m = chosen.dense_voxel_size_m, chosen.dense_source_voxel_m
+        coarse = fine[downsample(fine, source_m)]
+        planes = chosen.residual == "plane_to_plane"
+        normals = normals_at(coarse, fine, voxel_m) if planes else None
+        return ThinScan(scan.scan_index, scan.reference_ns, fine, coarse, voxel_m, normals)
+
+
+def surface_share(points: F8, voxel_m: float) -> float:
+    """Share of the points (n, 3), m, one a voxel, that lie on a surface within this reach."""
+    some = points[downsample(points, voxel_m)]
+    return float(normals_at(some, points, voxel_m).any(axis=1).mean())
 
 
 @kernel

@@ -41,6 +41,8 @@ class Tracker:
         self.settings = settings
         self.predictor = predictor
         self.guesses = forward_guesses(T_base_lidar)
+        self.voxel_size_m = settings.voxel_size_m
+        self.normals: F8 | None = None
         self.map = self._new_map()
         self.T = np.eye(4)
         self.last_ns = 0
@@ -62,7 +64,9 @@ class Tracker:
 
     def step(self, scan: ThinScan) -> None:
         """Take the next scan; its row is the last of `rows`."""
+        self.voxel_size_m, self.normals = scan.voxel_size_m, scan.normals
         if not len(self.rows):
+            self.map = self._new_map()
             self.rows.add(self._begin(scan.scan_index, scan.stamp_ns, scan.fine))
             return
         prediction = self.predictor.predict(self.last_ns, scan.stamp_ns)
@@ -161,7 +165,9 @@ class Tracker:
 
     def _judge(self, registration: Registration, prediction: Prediction) -> Degeneracy:
         snr = self.settings.measured_snr if prediction.measured else self.settings.snr
-        return judge(registration, point_noise_m=self.settings.point_noise_m, snr=snr)
+        return judge(
+            registration, point_noise_m=self.settings.point_noise_m, snr=snr, kind=self.settings.indicator
+        )
 
     def _slid(self, registration: Registration, coarse: F8, prediction: Prediction, target: VoxelMap) -> bool:
         """Whether a registration is not credible only because it slid along directions that the scan does not tell."""
@@ -223,8 +229,8 @@ class Tracker:
     ) -> Registration:
         scale = float(np.clip(self.deviation.rms_m, self.settings.least_scale_m, self.settings.most_scale_m))
         return align(
-            target, coarse, T, max_distance_m=self.settings.voxel_size_m, scale_m=scale,
-            max_iterations=self.settings.max_iterations, free=free, held=held,
+            target, coarse, T, max_distance_m=target.voxel_size_m, scale_m=scale,
+            max_iterations=self.settings.max_iterations, free=free, held=held, source_normals=self.normals,
         )  # fmt: skip
 
     def _credible(self, registration: Registration, points: int, prediction: Prediction) -> bool:
@@ -324,7 +330,7 @@ class Tracker:
         return True
 
     def _new_map(self) -> VoxelMap:
-        return VoxelMap(self.settings.voxel_size_m, self.settings.points_per_voxel)
+        return VoxelMap(self.voxel_size_m, self.settings.points_per_voxel)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.geometry.se3 import pose, so3_exp
 from scanloom.stages.odometry import Settings, odometry
 from scanloom.stages.odometry.prediction import Predictor
+from scanloom.stages.odometry.thinning import Thinner, surface_share
 from tests.stages.odometry.drives import (
     Drive,
     drive_along,
@@ -236,3 +237,49 @@ def test_slip_in_a_tunnel_is_bounded_by_the_accelerometer() -> None:
     assert 0.02 < off < 0.6
     steady = track.covariance[10, 3, 3]
     assert track.covariance[17, 3, 3] > 4 * steady, "slip is said in the covariance"
+
+
+def test_minutes_of_standing_drift_by_less_than_two_centimetres() -> None:
+    """Two minutes at 10 Hz, the same hundred scans again and again, in random order so that noise does not repeat."""
+    still = drive_along(street(2), 60, step_m=0.0)
+    order = np.random.default_rng(0).integers(0, 60, 1200)
+    start = still.scans[0].reference_ns
+    scans = [
+        dataclasses.replace(still.scans[k], reference_ns=start + i * 100_000_000, scan_index=i)
+        for i, k in enumerate(order)
+    ]
+    track = dataclasses.replace(still, scans=scans).run(sensors=False, chunk=200)
+    way = np.linalg.norm(track.T_odom_lidar[:, :3, 3], axis=1)
+    assert way.max() < 0.02
+    assert 0 < way[-100:].mean() < 0.01
+    assert track.reliable.all()
+    assert track.keyframe.sum() == 1 + 119 // 5, "one every five seconds"
+
+
+@pytest.mark.parametrize("change", [{"residual": "plane_to_plane"}, {"indicator": "E2"}, {"indicator": "E3"}])
+def test_the_forms_of_residual_and_of_e(
+    street_drive: Drive, street_track: Odometry, change: dict[str, str]
+) -> None:
+    short = dataclasses.replace(street_drive, scans=street_drive.scans[:12])
+    track = short.run(Settings(**change))
+    assert track.reliable.all()
+    assert end_error_m(track, street_drive.truth[:12]) < 0.05
+    assert (track.degeneracy_e[1:] > 0).all()
+    if "indicator" in change:
+        np.testing.assert_array_equal(track.T_odom_lidar, street_track.T_odom_lidar[:12])
+        assert (track.degeneracy_e[1:] > street_track.degeneracy_e[1:12]).all()
+
+
+def test_dense_scans_get_a_finer_map(street_drive: Drive) -> None:
+    scan = observe(street(2), np.eye(4), rng=np.random.default_rng(0), rows=64, columns=1024)
+    for scans, wanted in ((scan, 0.7), (street_drive.scans[0], 1.0)):
+        thinned = Thinner(Settings(dense_share=0.2)).thin(scans, labelled(scans))
+        share = surface_share(thinned.fine, 0.7)
+        assert thinned.voxel_size_m == (0.7 if share >= 0.2 else 1.0) == wanted
+    exact = surface_share(Thinner(Settings()).thin(scan, labelled(scan)).fine, 0.7)
+    for limit, wanted in ((exact, 0.7), (np.nextafter(exact, 1), 1.0)):
+        assert Thinner(Settings(dense_share=limit)).thin(scan, labelled(scan)).voxel_size_m == wanted
+    empty = DeskewedScan.empty(reference_ns=0, scan_index=0)
+    thinner = Thinner(Settings(dense_share=0.2))
+    assert thinner.thin(empty, labelled(empty)).voxel_size_m == 1.0
+    assert thinner.thin(scan, labelled(scan)).voxel_size_m == 0.7, "an empty first scan decides nothing"
