@@ -18,6 +18,7 @@ from scanloom.schemas.scans import Scans
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.stages.geometry.motion import MotionTrack
+from scanloom.stages.geometry.rig import corrected
 from scanloom.stages.geometry.se3 import F8, adjoint
 from scanloom.stages.sensors.agreement import Seen, seconds
 from scanloom.stages.sensors.inertial import check_imu
@@ -60,11 +61,14 @@ def sensors(settings: Settings, scans: Parts[Scans], session: Session, imu: Imu,
     where = places(parts)
     starts = _starts(settings, where, imu, wheel)
     found = motions(parts, where, starts, MotionTrack.build(Imu.empty(), Wheel.empty(), session))
-    turning, driving = _seen(found, session)
     stood = len(MotionTrack.build(imu, wheel, session).standstill) > 0
     limit = settings.max_clock_offset_s
-    imu_check, said_of_imu = check_imu(imu, turning, np.array(session.T_base("imu")), limit, stood)
-    wheel_check, said_of_wheel = check_wheel(wheel, driving, limit)
+    T_base_imu = np.array(session.T_base("imu"))
+    imu_check, said_of_imu = check_imu(imu, _turn_rates(found, session), T_base_imu, limit, stood)
+    if len(wheel) > 1 and imu_check.verdict in ("agrees", "corrected"):
+        gyro = corrected(imu, Wheel.empty(), SensorCheck(imu=imu_check))
+        found = found.again(MotionTrack.build(*gyro, session))
+    wheel_check, said_of_wheel = check_wheel(wheel, _speeds(found, session), limit)
     if not settings.correct:
         imu_check, wheel_check = _neutral(imu_check), _neutral(wheel_check)
     return SensorCheck(imu=imu_check, wheel=wheel_check, remarks=(*said_of_imu, *said_of_wheel))
@@ -84,13 +88,25 @@ def _starts(settings: Settings, where: list[Place], imu: Imu, wheel: Wheel) -> l
     )
 
 
-def _seen(found: Motions, session: Session) -> tuple[Seen, Seen]:
-    """Turn rates (m, 3) and the speed (m, 1) of the wheels' place along x, both in the base frame."""
-    T_base_lidar, wheel_position = np.array(session.T_base("lidar")), np.array(session.T_base("wheel"))[:3, 3]
-    twist: F8 = found.twist @ adjoint(T_base_lidar).T
-    speed = twist[:, 3:] + np.cross(twist[:, :3], wheel_position)
-    start_s, end_s = seconds(found.start_ns), seconds(found.end_ns)
-    return Seen(start_s, end_s, twist[:, :3]), Seen(start_s, end_s, speed[:, :1])
+def _turn_rates(found: Motions, session: Session) -> Seen:
+    """(m, 3) in the base frame, rad/s."""
+    return _seen(found, _base_twists(found, session)[:, :3])
+
+
+def _speeds(found: Motions, session: Session) -> Seen:
+    """(m, 1) of the wheels' place along x of the base, m/s."""
+    twist, wheel_position = _base_twists(found, session), np.array(session.T_base("wheel"))[:3, 3]
+    velocity = twist[:, 3:] + np.cross(twist[:, :3], wheel_position)
+    return _seen(found, velocity[:, :1])
+
+
+def _base_twists(found: Motions, session: Session) -> F8:
+    twist: F8 = found.twist @ adjoint(np.array(session.T_base("lidar"))).T
+    return twist
+
+
+def _seen(found: Motions, value: F8) -> Seen:
+    return Seen(seconds(found.start_ns), seconds(found.end_ns), value)
 
 
 def _neutral(check: Check) -> Check:

@@ -12,7 +12,8 @@ from scanloom.stages.sensors.clock import clear_offset, said_of_clock
 
 UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "cm/s": 0.01, "mm/s": 0.001}
 UNIT_TOLERANCE = 0.1
-FITS = 0.9
+FITS = 0.98
+"""Correlation with the speed between scans; slip and wrong registrations stay below."""
 MOVING_M_S = 0.5
 LEAST_EXCITATION_M_S = 0.3
 LEAST_SCALE_ERROR, CLEAR_SCALE, LARGEST_SCALE_STD = 0.004, 4.0, 0.005
@@ -33,7 +34,8 @@ def check_wheel(wheel: Wheel, seen: Seen, max_lag_s: float) -> tuple[WheelCheck,
     found = max(agree(usable, readings, EITHER_WAY, max_lag_s, biased=False), key=lambda a: a.correlation)
     lively = found.excitation > LEAST_EXCITATION_M_S and found.correlation > FITS
     lively = lively and abs(found.lag_s) < max_lag_s - 0.02
-    ratio, ratio_std = _ratio(usable, readings, found.lag_s if lively else 0.0)
+    offset = clear_offset(found) if lively else 0.0
+    ratio, ratio_std = _ratio(usable, readings, offset)
     unit = next((n for n, size in UNITS.items() if abs(abs(ratio) / size - 1) < UNIT_TOLERANCE), None)
     check = WheelCheck(
         verdict="agrees", measured_ratio=ratio, measured_ratio_std=ratio_std, scan_pairs=moving
@@ -43,7 +45,6 @@ def check_wheel(wheel: Wheel, seen: Seen, max_lag_s: float) -> tuple[WheelCheck,
         return check.model_copy(update={"verdict": "contradicts"}), [text]
     factor = float(np.sign(ratio)) * UNITS[unit]
     scale = _scale(ratio / factor, ratio_std / abs(factor))
-    offset = clear_offset(found) if lively else 0.0
     remarks = _remarks(unit, factor, scale)
     if lively:
         remarks.append(said_of_clock("Wheels", found, offset))

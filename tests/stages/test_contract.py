@@ -34,6 +34,7 @@ CONTENT_WITH_NOTHING = {
     "deskew",
     "denoise",
     "places",
+    "sensors",
 }
 """May answer emptiness with an empty product (no truth, no tiles, no loops) instead of an error."""
 
