@@ -13,6 +13,7 @@ from scanloom.pipeline.node import Node
 from scanloom.pipeline.task import imported
 from scanloom.schemas.errors import ScanloomError
 from scanloom.schemas.product import Document, Files, Part, Parts, Product, Stream, Table, attributes_of
+from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.session import Session, TruthLog
 from scanloom.schemas.trajectory import Truth
 from scanloom.workflows.map_session import NODES
@@ -137,6 +138,8 @@ def _nothing(product: type[Product]) -> Product:
         return product()
     if issubclass(product, Stream):
         return product([])
+    if product is SensorCheck:
+        return SensorCheck()
     if issubclass(product, Document):
         assert product is Session
         return Session(
