@@ -221,7 +221,7 @@ class Tracker:
     ) -> Registration:
         """From the predicted pose, which counts as far as it is known; not at all while the map is lost."""
         known = prediction.known and not self.rows.lost
-        held = np.linalg.inv(self.belief.expected(prediction)) if known else None
+        held: F8 | None = np.linalg.inv(self.belief.expected(prediction)) if known else None
         return self._align(coarse, self.T @ prediction.T_last_now, target, free, held)
 
     def _align(
