@@ -33,8 +33,8 @@ class Belief:
     def registered(self, prediction: Prediction, information: F8) -> tuple[Belief, F8]:
         """After a registration with R^-1 = `information` (6, 6); and the covariance (6, 6) of the motion to it."""
         carried, predicted = self._carried(prediction), prediction.covariance
-        joint: F8 = np.linalg.inv(np.linalg.inv(carried + predicted) + information)
-        after = _symmetric(joint)
+        joint = np.linalg.inv(np.linalg.inv(carried + predicted) + information)
+        after = _symmetric(np.asarray(joint, np.float64))
         gain = after @ information
         rest = np.eye(6) - gain
         noise = after @ information @ after

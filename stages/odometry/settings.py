@@ -78,7 +78,7 @@ class Settings(BaseModel):
         0.9,
         ge=0.0,
         le=1.0,
-        description="directions observed with less probability are taken from the prediction",
+        description="directions observed with less probability are taken from the prediction; 0: the scan alone decides",
     )
     snr: float = Field(
         10.0,

@@ -220,8 +220,8 @@ class Tracker:
         self, coarse: F8, prediction: Prediction, target: VoxelMap, free: F8 | None = None
     ) -> Registration:
         """From the predicted pose, which counts as far as it is known; not at all while the map is lost."""
-        known = prediction.known and not self.rows.lost
-        held: F8 | None = np.linalg.inv(self.belief.expected(prediction)) if known else None
+        known = prediction.known and not self.rows.lost and self.settings.least_p > 0
+        held = np.asarray(np.linalg.inv(self.belief.expected(prediction)), np.float64) if known else None
         return self._align(coarse, self.T @ prediction.T_last_now, target, free, held)
 
     def _align(
