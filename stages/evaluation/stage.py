@@ -9,12 +9,14 @@ from pydantic import BaseModel, ConfigDict, Field
 from scanloom.schemas.evaluation import ErrorTrack, Metrics
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.product import Part, Parts
+from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.session import Session
 from scanloom.schemas.tiles import Tile
 from scanloom.schemas.trajectory import Odometry, Poses, Truth
 from scanloom.stages.evaluation.crispness import map_figures
 from scanloom.stages.evaluation.figures import Figure, to_metrics
 from scanloom.stages.evaluation.revisits import loop_figures, true_path
+from scanloom.stages.evaluation.sensors import sensor_figures
 from scanloom.stages.evaluation.trajectories import error_track, trajectory_figures, truth_figures
 
 VERSION = 1
@@ -49,6 +51,7 @@ def evaluation(
     poses: Parts[Poses],
     loops: Loops,
     tiles: Parts[Tile],
+    check: Parts[SensorCheck] | None = None,
 ) -> Iterator[Part[ErrorTrack] | Metrics]:
     """Yield the error track of every session with truth, then the metrics of all sessions and of the map.
 
@@ -57,9 +60,11 @@ def evaluation(
     truths = {c["session"]: t for c, t in truth.items() if len(t)}
     odometries = {c["session"]: o for c, o in odometry.items()}
     optimised = {c["session"]: p for c, p in poses.items()}
+    checks = {c["session"]: (found,) for c, found in check.items()} if check is not None else {}
     figures: list[Figure] = []
     for name in sorted(odometries.keys() & optimised.keys()):
         figures += _of(name, trajectory_figures(odometries[name], optimised[name]))
+        figures += [f for found in checks.get(name, ()) for f in _of(name, sensor_figures(found))]
         if name in truths:
             figures += _of(name, truth_figures(truths[name], odometries[name], optimised[name]))
             track = error_track(truths[name], odometries[name], optimised[name])

@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from scanloom.schemas.errors import StageError
 from scanloom.schemas.product import Parts, ProductT
+from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.session import Session
-from scanloom.schemas.tracks import Gnss, Imu
+from scanloom.schemas.tracks import Gnss, Imu, Wheel
 from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.geometry.interpolation import interpolate_poses
+from scanloom.stages.geometry.rig import corrected
 from scanloom.stages.geometry.se3 import F8, adjoint, inverse
 
 I8 = NDArray[np.int64]
@@ -128,15 +130,20 @@ def _trusted(covariance: F8) -> F8:
 
 
 def gather(
-    session: Parts[Session], odometry: Parts[Odometry], gnss: Parts[Gnss], imu: Parts[Imu]
+    session: Parts[Session],
+    odometry: Parts[Odometry],
+    gnss: Parts[Gnss],
+    imu: Parts[Imu],
+    check: Parts[SensorCheck] | None = None,
 ) -> Iterator[Drive]:
-    """The sessions of a map in order of their names.
+    """The sessions of a map in order of their names; the IMU is corrected as `check` says.
 
     Raises
     ------
     StageError : a session has no odometry.
     """
     tracks, fixes, inertial = _by_session(odometry), _by_session(gnss), _by_session(imu)
+    checks = _by_session(check) if check is not None else {}
     first_node = 0
     for name, document in _by_session(session).items():
         track = tracks.get(name)
@@ -146,6 +153,7 @@ def gather(
                 where=f"session {name}",
                 next_step="look why odometry gave no scan a pose",
             )
+        inertia, _ = corrected(inertial.get(name, Imu.empty()), Wheel.empty(), checks.get(name))
         keyframes = np.flatnonzero(track.keyframe).astype(np.int64)
         if not len(keyframes):
             keyframes = np.unique([0, len(track) - 1]).astype(np.int64)
@@ -154,7 +162,7 @@ def gather(
             document,
             track,
             fixes.get(name, Gnss.empty()),
-            inertial.get(name, Imu.empty()),
+            inertia,
             first_node,
             keyframes,
         )

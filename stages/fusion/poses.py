@@ -15,6 +15,7 @@ from scanloom.schemas.frames import MAP, WORLD, Georeference
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.product import Part, Parts
+from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Gnss, Imu
 from scanloom.schemas.trajectory import Odometry, Poses
@@ -78,6 +79,7 @@ def fusion(
     loops: Loops,
     gnss: Parts[Gnss],
     imu: Parts[Imu],
+    check: Parts[SensorCheck] | None = None,
 ) -> Iterator[Part[Poses] | Graph]:
     """Optimised poses of every scan, one part per session, then the graph.
 
@@ -88,7 +90,7 @@ def fusion(
     ------
     StageError : a session has no odometry, or nothing ties it to the others.
     """
-    drives = list(gather(session, odometry, gnss, imu))
+    drives = list(gather(session, odometry, gnss, imu, check))
     if not drives:
         raise StageError("there is no session to fuse", next_step="add a session to the map")
     ups = [gravity(d, settings.gravity_spacing_m) for d in drives]

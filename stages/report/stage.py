@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scanloom.schemas.evaluation import ErrorTrack, Metrics, ReportFiles
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.product import Parts
+from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.session import Session
 from scanloom.schemas.tiles import Tile, TileIndex
 from scanloom.schemas.tracks import Gnss
@@ -80,6 +81,7 @@ def report(
     tile_index: TileIndex,
     tiles: Parts[Tile],
     gnss: Parts[Gnss],
+    check: Parts[SensorCheck] | None = None,
 ) -> ReportFiles:
     """Judge the map, draw it, and write the body of the report.
 
@@ -103,6 +105,7 @@ def report(
         charts=_charts(error_track),
         tables=metric_tables(sessions, figures),
         sessions=sessions,
+        checks={c["session"]: found for c, found in check.items()} if check is not None else {},
         tiles=tile_index,
         tile_rows=tile_rows(tile_index),
         georeference=tile_index.georeference,

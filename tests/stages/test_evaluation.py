@@ -8,6 +8,7 @@ import pytest
 from scanloom.schemas.evaluation import ErrorTrack, Metrics
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.product import Part, Parts
+from scanloom.schemas.rig import ImuCheck, SensorCheck, WheelCheck
 from scanloom.schemas.tiles import Tile
 from scanloom.schemas.trajectory import Truth
 from scanloom.stages.evaluation import evaluation
@@ -300,6 +301,24 @@ def test_unreliable_scans_are_counted() -> None:
     metrics = made[-1]
     assert isinstance(metrics, Metrics)
     assert dict(zip(metrics.name, metrics.value))["odometry.unreliable_scans"] == 2
+
+
+def test_what_was_measured_of_the_sensors_is_a_figure_and_what_was_not_is_none() -> None:
+    T = circle(30)
+    check = SensorCheck(
+        imu=ImuCheck(verdict="corrected", measured_offset_s=0.04),
+        wheel=WheelCheck(verdict="contradicts", measured_ratio=0.5),
+    )
+    *_, metrics = evaluation(
+        Settings(), one(session_of()), one(Truth.empty(source="")), one(odometry_of(T)), one(poses_of(T)), Loops.empty(),
+        Parts([]), one(check),
+    )  # fmt: skip
+    assert isinstance(metrics, Metrics)
+    figures = dict(zip(metrics.name, metrics.value))
+    assert figures["sensors.imu_clock_offset_s"] == 0.04
+    assert figures["sensors.wheel_ratio"] == 0.5
+    assert figures["sensors.contradicting"] == 1
+    assert "sensors.wheel_clock_offset_s" not in figures
 
 
 def test_the_sample_is_seeded_and_spread_over_all_tiles() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from scanloom.schemas.errors import StageError
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.pose_graph import Graph
+from scanloom.schemas.rig import ImuCheck, SensorCheck
 from scanloom.schemas.tracks import Gnss, Imu
 from scanloom.schemas.trajectory import Odometry, Poses
 from scanloom.stages.fusion import Settings, fusion
@@ -176,6 +178,29 @@ def test_level_assumption_without_imu() -> None:
     assert poses.frame == "world"
     assert 0.01 < ate(in_truth_frame(poses), WORLD.T, align=False) < 0.2
     assert (graph.kind == "gravity").sum() == 1
+
+
+def test_imu_is_read_as_the_check_of_the_sensors_says() -> None:
+    """In g and with its axes permuted: no gravity to be believed until both are put right."""
+    imu = imu_of(WORLD)
+    odd = dataclasses.replace(imu, accel_m_s2=imu.accel_m_s2[:, [2, 0, 1]] / 9.81)
+    axes = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+    right = SensorCheck(imu=ImuCheck(verdict="corrected", accel_factor=9.81, accel_axes=axes, gyro_axes=axes))
+
+    def gravity_factors(check: SensorCheck) -> int:
+        given = (
+            parts(a=session_of("a", WORLD)),
+            parts(a=ODOMETRY),
+            NO_LOOPS,
+            parts(a=gnss_of(WORLD)),
+            parts(a=odd),
+        )
+        *_, graph = fusion(Settings(), *given, parts(a=check))
+        assert isinstance(graph, Graph)
+        return int((graph.kind == "gravity").sum())
+
+    assert gravity_factors(right) > 10
+    assert gravity_factors(SensorCheck()) == 1
 
 
 def test_imu_mounted_on_its_side_is_not_believed() -> None:

@@ -15,6 +15,7 @@ from scanloom.schemas.evaluation import ErrorTrack, Metrics, ReportFiles
 from scanloom.schemas.frames import Georeference
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.product import Parts
+from scanloom.schemas.rig import SensorCheck, WheelCheck
 from scanloom.schemas.session import Problem, Session, Topic
 from scanloom.schemas.tiles import Tile, TileIndex
 from scanloom.schemas.tracks import Gnss
@@ -279,3 +280,11 @@ def test_fleet_page_shows_changes_failures_and_links() -> None:
     assert "clock jumps" in parser.text
     assert "1 of 2" in parser.text
     parse(fleet_page([], made="today"))
+
+
+def test_what_the_scans_said_of_the_sensors_is_told_and_escaped(street_map: Map) -> None:
+    check = SensorCheck(wheel=WheelCheck(verdict="contradicts"), remarks=("Wheels: <no> known unit.",))
+    page = body(street_map.report(check=one(check)))
+    assert "Wheels: &lt;no&gt; known unit." in page
+    assert '<span class="pill warning">sensors</span>' in page
+    assert "sensors</span>" not in body(street_map.report())
