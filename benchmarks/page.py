@@ -79,4 +79,7 @@ def _table(wanted: Mapping[str, str], by_name: Mapping[str, Row]) -> Iterator[st
 
 
 def _cell(row: Row | None) -> str:
-    return "" if row is None else f"{row['value']:.3g}"
+    if row is None:
+        return ""
+    value = float(row["value"])
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
