@@ -155,3 +155,12 @@ def test_interpolation_meets_its_nodes_and_keeps_the_ends(xi: list[np.ndarray]) 
 @pytest.mark.parametrize("yaw", [-3.0, -0.5, 0.0, 1.2, 3.14])
 def test_yaw_is_the_heading(yaw: float) -> None:
     assert abs(yaw_of(so3_exp([0, 0, yaw])) - yaw) < 1e-12
+
+
+@given(tangents())
+def test_one_pose_gives_what_a_stack_gives(xi):
+    """Single poses go through kernels of their own."""
+    T = se3_exp(xi)
+    assert np.allclose(T, se3_exp(xi[None])[0], rtol=0, atol=1e-12 * (1 + np.abs(xi).max()))
+    assert np.allclose(se3_log(T), se3_log(T[None])[0], rtol=0, atol=1e-9 * (1 + np.abs(xi).max()))
+    assert np.allclose(inverse(T), inverse(T[None])[0], rtol=0, atol=1e-12 * (1 + np.abs(xi).max()))
