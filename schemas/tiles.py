@@ -16,6 +16,7 @@ class Piece(Table):
     """What one chunk adds to one tile: sums per voxel, to be merged. One part per tile, keyed `X_Y`."""
 
     NAME: ClassVar[str] = "piece"
+    ON_THE_WAY: ClassVar[bool] = True
     SPLIT_BY: ClassVar[str] = "tile"
 
     voxel: NDArray[np.int32] = column("i4", "voxel index from the tile's corner", shape=(3,))

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scanloom.stages.geometry.halves import in_halves
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8
 
@@ -33,10 +34,17 @@ def point_entropies(
         raise ValueError(f"radii must increase: {radii_m}")
     radii = np.array(radii_m, float)
     columns = _Columns(points, float(radii.max()) / REACH)
-    return _entropies(
-        columns.points, columns.starts, columns.shape, columns.low, columns.size_m,
-        points[queries].astype(np.float32), radii, min_neighbours,
-    )  # fmt: skip
+    wanted = points[queries].astype(np.float32)
+    out = np.full((len(queries), len(radii)), np.nan)
+
+    def work(rows: slice) -> None:
+        _entropies(
+            columns.points, columns.starts, columns.shape, columns.low, columns.size_m, wanted[rows], radii,
+            min_neighbours, out[rows],
+        )  # fmt: skip
+
+    in_halves(work, len(wanted))
+    return out
 
 
 def mean_entropy(entropies: F8) -> tuple[F8, F8]:
@@ -91,9 +99,9 @@ def _counting_sort(cell: NDArray[np.int64], cells: int) -> tuple[NDArray[np.int6
 @kernel
 def _entropies(
     points: NDArray[np.float32], starts: NDArray[np.int64], shape: NDArray[np.int64], low: F8, size_m: float,
-    queries: NDArray[np.float32], radii: F8, min_neighbours: int,
-) -> F8:  # fmt: skip
-    out = np.full((len(queries), len(radii)), np.nan)
+    queries: NDArray[np.float32], radii: F8, min_neighbours: int, out: F8,
+) -> None:  # fmt: skip
+    """Fill `out` (m, k), which is NaN, for the queries (m, 3)."""
     squared_radii = radii * radii
     for i in range(len(queries)):
         sums = np.zeros((len(radii), 10))  # count, x y z, xx xy xz yy yz zz about the query
@@ -109,7 +117,6 @@ def _entropies(
                 sums[k] += sums[k - 1]
             if sums[k, 0] >= min_neighbours:
                 out[i, k] = _entropy(sums[k])
-    return out
 
 
 @kernel
