@@ -24,22 +24,23 @@ from scanloom.pipeline.fingerprint import code_version, digest
 from scanloom.schemas.trajectory import Truth
 
 OURS = "scanloom"
-PEERS = ("kiss_icp", "small_gicp")
+PEERS = {
+    "kiss_icp": "its better variant",
+    "small_gicp": "from the same raw scans, its better voxel size",
+    "vgicp_on_our_scans": "VGICP on scans compensated by our deskew, its better voxel size: registration alone",
+}
+"""Whom we compare with, and what of them."""
 SYSTEMS = (OURS, *PEERS)
 Options = dict[str, Any]
 VARIANTS: Mapping[str, Mapping[str, Options]] = {
     OURS: {"": {}},
     "kiss_icp": {"deskew": {"deskew": True}},
-    "small_gicp": {
-        f"{scans}_{voxel:g}m": {"voxel_m": voxel, "scans": scans}
-        for scans in ("own", "ours")
-        for voxel in (0.5, 1.0)
-    },
+    "small_gicp": {f"{voxel:g}m": {"voxel_m": voxel, "scans": "own"} for voxel in (0.5, 1.0)},
+    "vgicp_on_our_scans": {f"{voxel:g}m": {"voxel_m": voxel, "scans": "ours"} for voxel in (0.5, 1.0)},
 }
 """Of a system with variants the one with the smaller error over 10 m stands for it, sequence by sequence."""
 REAL_VARIANTS: Mapping[str, Mapping[str, Options]] = {"kiss_icp": {"raw": {"deskew": False}}}
 """Tried on logs of real sensors as well."""
-OWN_SCANS = "own"
 RATIO = "rpe10_m"
 
 
@@ -72,23 +73,24 @@ class Runner:
         own = recording.one(Truth)
         if len(own) and not own.source.startswith("OXTS"):
             return own, None
-        rough = self.outcome("small_gicp", recording, VARIANTS["small_gicp"]["own_1m"])
+        rough = self.outcome("small_gicp", recording, VARIANTS["small_gicp"]["1m"])
         return reference.kept(recording, rough.T, self.folder), own if len(own) else None
 
     def outcome(self, system: str, recording: Recording, options: Options) -> Outcome:
         """What a system says; its earlier word is taken when the system and its input are the same."""
         if system == OURS:
             options = {**options, "settings": {**self.settings, **options.get("settings", {})}}
+        program = systems.program(system)
         words = re.sub(r"[^\w.=,-]+", "", "-".join(f"{k}={v}" for k, v in sorted(options.items())))
         name = "_".join(
-            (recording.name, system, systems.version(system), words, _digest(system, recording, options))
+            (recording.name, program, systems.version(system), words, _digest(system, recording, options))
         )
         kept = self.folder / f"{name}.npz"
         if kept.exists() and not self.fresh:
             return Outcome.read(kept)
         self.folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=self.folder) as folder:
-            outcome = _run(system, recording, options, Path(folder))
+            outcome = _run(program, recording, options, Path(folder))
             (Path(folder) / "out.npz").replace(kept)
         return outcome
 
@@ -123,6 +125,7 @@ class Runner:
         whole = float(again.extra["whole_ms"]) / len(again.T)
         yield Score("ms_per_frame_pipeline", whole, "ms", "mean, reading included, all cores")
         yield from scores.deskewing(outcome)
+        yield from scores.sensors(outcome)
         yield from scores.candour(truth, outcome)
 
 
@@ -134,16 +137,21 @@ def _digest(system: str, recording: Recording, options: Options) -> str:
     return digest([code, recording.made_digest])[:16]
 
 
-def _run(system: str, recording: Recording, options: Options, folder: Path) -> Outcome:
+def _run(program: str, recording: Recording, options: Options, folder: Path) -> Outcome:
     """In a process of its own, with all threads it wants."""
     order, out = folder / "order.json", folder / "out.npz"
-    body = {"system": system, "options": options, "out": str(out), "recording": dataclasses.asdict(recording)}
+    body = {
+        "program": program,
+        "options": options,
+        "out": str(out),
+        "recording": dataclasses.asdict(recording),
+    }
     order.write_text(json.dumps(body))
     environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
     words = [sys.executable, "-m", "benchmarks.systems", str(order)]
     done = subprocess.run(words, env=environment, capture_output=True, text=True)
     if done.returncode:
-        raise SystemExit(f"{system} failed on {recording.name}:\n{done.stderr[-2000:]}")
+        raise SystemExit(f"{program} failed on {recording.name}:\n{done.stderr[-2000:]}")
     return Outcome.read(out)
 
 
@@ -152,49 +160,33 @@ def best(results: Sequence[Result]) -> Result:
     return min(results, key=lambda result: np.nan_to_num(result.value(RATIO), nan=np.inf))
 
 
-def ratios(
-    chosen: Mapping[tuple[str, str], Result], others: Mapping[tuple[str, str], Result]
-) -> Iterator[Score]:
-    """Ours over each peer. `chosen`: by (sequence, system), the best variant; `others`: small_gicp on its own scans."""
+def ratios(chosen: Mapping[tuple[str, str], Result]) -> Iterator[Score]:
+    """Ours over each peer. `chosen`: by (sequence, system), the best variant."""
     sequences = list(dict.fromkeys(sequence for sequence, _ in chosen))
-    for peer in PEERS:
-        yield from _error_ratios(peer, chosen, chosen, sequences, "its better variant")
-    yield from _error_ratios(
-        "small_gicp",
-        chosen,
-        others,
-        sequences,
-        "its better voxel size, scans deskewed at constant velocity",
-        "_own_scans",
-    )
+    for peer, which in PEERS.items():
+        yield from _error_ratios(peer, which, chosen, sequences)
     yield from _time_ratios(chosen, sequences)
 
 
 def _error_ratios(
-    peer: str, ours: Mapping[tuple[str, str], Result], theirs: Mapping[tuple[str, str], Result],
-    sequences: Sequence[str], which: str, suffix: str = "",
-) -> Iterator[Score]:  # fmt: skip
+    peer: str, which: str, chosen: Mapping[tuple[str, str], Result], sequences: Sequence[str]
+) -> Iterator[Score]:
     found = {}
+    how = f"ours over {peer}, error over 10 m, {which}"
     for sequence in sequences:
-        own, other = ours.get((sequence, OURS)), theirs.get((sequence, peer))
+        own, other = chosen.get((sequence, OURS)), chosen.get((sequence, peer))
         if own and other and np.isfinite(own.value(RATIO) / other.value(RATIO)):
             found[sequence] = (own.value(RATIO) / other.value(RATIO), own.recording.simulated)
-            how = f"error over 10 m, ours over that of {peer}, {which}"
-            yield Score(f"ratio.{peer}{suffix}.{sequence}", found[sequence][0], "", how)
+            yield Score(f"ratio.{peer}.{sequence}", found[sequence][0], "", how)
     if not found:
         return
     values = [value for value, _ in found.values()]
     simulated = [value for value, made in found.values() if made]
-    how = f"ours over {peer}, error over 10 m, {which}"
-    yield Score(f"ratio.{peer}{suffix}", float(np.mean(values)), "", f"mean over {_count(values)}: {how}")
-    yield Score(f"ratio.{peer}{suffix}.worst", float(max(values)), "", f"largest: {how}")
+    yield Score(f"ratio.{peer}", float(np.mean(values)), "", f"mean over {_count(values)}: {how}")
+    yield Score(f"ratio.{peer}.worst", float(max(values)), "", f"largest: {how}")
     if simulated:
-        yield Score(
-            f"ratio.{peer}{suffix}.simulated",
-            float(np.mean(simulated)),
-            "",
-            f"simulated sequences only: {how}",
-        )
+        mean = float(np.mean(simulated))
+        yield Score(f"ratio.{peer}.simulated", mean, "", f"simulated sequences only: {how}")
 
 
 def _time_ratios(chosen: Mapping[tuple[str, str], Result], sequences: Sequence[str]) -> Iterator[Score]:

@@ -14,7 +14,7 @@ from benchmarks.scores import Figure
 COLUMNS = {
     "rpe1_m": "RPE 1 m", "rpe5_m": "5 m", "rpe10_m": "10 m", "rpe20_m": "20 m", "kitti_t_rel_percent": "t_rel %",
     "kitti_r_rel_deg_per_100m": "r_rel deg/100m", "ate_m": "ATE m", "nees": "NEES", "ms_per_frame": "ms",
-    "ms_per_frame_p95": "ms p95", "deskew_ms_per_frame": "deskew ms", "threads": "threads", "peak_rss_mb": "MB",
+    "ms_per_frame_p95": "ms p95", "deskew_ms_per_frame": "deskew ms", "sensors_ms_per_session": "sensors ms", "threads": "threads", "peak_rss_mb": "MB",
     "unreliable_scans": "bridged", "lost_scans": "lost",
 }  # fmt: skip
 SUMMARY = (
@@ -27,7 +27,9 @@ SUMMARY = (
     "bench.deskew.",
 )
 LENGTHS_M = (1, 5, 10, 20)
-COLOURS = {"scanloom": "#1b7f5c", "kiss_icp": "#d1802b", "small_gicp": "#4a6fb5"}
+COLOURS = {
+    "scanloom": "#1b7f5c", "kiss_icp": "#d1802b", "small_gicp": "#4a6fb5", "vgicp_on_our_scans": "#9db4dd",
+}  # fmt: skip
 Chosen = Mapping[tuple[str, str], Result]
 
 

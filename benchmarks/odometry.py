@@ -24,7 +24,7 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks import display, page, pairs, systems, tunnel, walls
-from benchmarks.comparison import OURS, OWN_SCANS, PEERS, SYSTEMS, Result, Runner, best, ratios
+from benchmarks.comparison import OURS, PEERS, SYSTEMS, Result, Runner, best, ratios
 from benchmarks.scores import Figure, Score
 from benchmarks.sequences import Recording, drives, make
 
@@ -49,7 +49,7 @@ def main(words: Sequence[str] | None = None) -> None:
         list(runner.results(s, r)) for r in _told(recordings) for s in options.systems if systems.version(s)
     ]
     chosen = {(found[0].recording.name, found[0].system): best(found) for found in results}
-    figures = [*_figures(chosen), *_variants(results), *_ratios(chosen, results)]
+    figures = [*_figures(chosen), *_variants(results), *_ratios(chosen)]
     if not options.quick and OURS in options.systems:
         figures += _extras(runner, recordings, chosen, options)
     _show(options, figures, chosen, time.monotonic() - started)
@@ -80,7 +80,7 @@ def _options(words: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _greet(wanted: Sequence[str]) -> None:
-    missing = [system for system in wanted if not systems.version(system)]
+    missing = dict.fromkeys(systems.program(system) for system in wanted if not systems.version(system))
     if missing:
         console.print(
             f"[yellow]{' and '.join(missing)} not installed: run `make bench-setup`; going on without.[/]"
@@ -120,17 +120,8 @@ def _variants(results: Sequence[Sequence[Result]]) -> Iterator[Figure]:
                     yield _figure(place, score, result.recording.name)
 
 
-def _ratios(
-    chosen: Mapping[tuple[str, str], Result], results: Sequence[Sequence[Result]]
-) -> Iterator[Figure]:
-    apart = {
-        (found[0].recording.name, found[0].system): best(
-            [r for r in found if r.variant.startswith(OWN_SCANS)]
-        )
-        for found in results
-        if found[0].system == PEERS[1]
-    }
-    for score in ratios(chosen, apart):
+def _ratios(chosen: Mapping[tuple[str, str], Result]) -> Iterator[Figure]:
+    for score in ratios(chosen):
         yield _figure(score.name, score, "all")
 
 
@@ -184,7 +175,8 @@ def _remark(seconds: float) -> str:
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True
     ).stdout.strip()
-    peers = ", ".join(f"{system} {systems.version(system) or 'not there'}" for system in PEERS)
+    programs = dict.fromkeys(systems.program(peer) for peer in PEERS)
+    peers = ", ".join(f"{program} {systems.version(program) or 'not there'}" for program in programs)
     cores = len(os.sched_getaffinity(0))
     return f"Measured at commit {commit or 'unknown'}, {cores} cores, {peers}; the whole run took {seconds / 60:.1f} minutes."
 

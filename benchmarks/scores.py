@@ -120,6 +120,18 @@ def deskewing(outcome: Outcome) -> Iterator[Score]:
     yield Score("deskew_ms_per_frame_files", with_files, "ms", "mean, Parquet read and written, one core")
 
 
+def sensors(outcome: Outcome) -> Iterator[Score]:
+    """Time of the check of IMU and wheels; nothing of a result kept from before it was taken."""
+    if "sensors_ms" not in outcome.extra:
+        return
+    ms, how = (
+        float(outcome.extra["sensors_ms"]),
+        "IMU and wheels checked once per session, one core, from files",
+    )
+    yield Score("sensors_ms_per_session", ms, "ms", how)
+    yield Score("sensors_ms_per_scan", ms / len(outcome.T), "ms", f"{how}; over all scans of the session")
+
+
 def candour(truth: Truth | None, outcome: Outcome) -> Iterator[Score]:
     """How honest our odometry is about itself; against exact truth where there is such."""
     yield Score(

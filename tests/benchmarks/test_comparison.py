@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks import reference
-from benchmarks.comparison import Result, best, ratios
+from benchmarks import reference, scores, systems
+from benchmarks.comparison import VARIANTS, Result, Runner, best, ratios
 from benchmarks.scores import Score
 from benchmarks.sequences import drives
 from benchmarks.systems import Clock, Outcome, _orthonormal
@@ -39,13 +39,48 @@ def test_ratios_are_means_of_ratios() -> None:
         ("real", "scanloom"): result("real", "scanloom", rpe10_m=0.3, **times),
         ("real", "kiss_icp"): result("real", "kiss_icp", rpe10_m=0.4, ms_per_frame_mean=40.0),
     }
-    said = {score.name: score.value for score in ratios(chosen, {})}
+    said = {score.name: score.value for score in ratios(chosen)}
     assert said["ratio.kiss_icp"] == pytest.approx((0.5 + 0.75) / 2)
     assert said["ratio.kiss_icp.worst"] == pytest.approx(0.75)
     assert said["ratio.kiss_icp.simulated"] == pytest.approx(0.5)
     assert said["time_ratio.odometry"] == pytest.approx((0.5 + 0.25) / 2)
     assert said["time_ratio.with_deskew.worst"] == pytest.approx(0.6)
-    assert not [name for name in said if "small_gicp" in name]
+    assert not [name for name in said if "gicp" in name]
+
+
+def test_the_system_small_gicp_and_its_registration_alone_are_compared_apart() -> None:
+    chosen = {
+        ("a", "scanloom"): result("a", "scanloom", rpe10_m=0.3),
+        ("a", "small_gicp"): result("a", "small_gicp", rpe10_m=0.6),
+        ("a", "vgicp_on_our_scans"): result("a", "vgicp_on_our_scans", rpe10_m=0.2),
+    }
+    said = {score.name: score.value for score in ratios(chosen)}
+    assert said["ratio.small_gicp.a"] == said["ratio.small_gicp.worst"] == pytest.approx(0.5)
+    assert said["ratio.vgicp_on_our_scans.a"] == said["ratio.vgicp_on_our_scans"] == pytest.approx(1.5)
+    scans = {s: {o["scans"] for o in VARIANTS[s].values()} for s in ("small_gicp", "vgicp_on_our_scans")}
+    assert scans == {"small_gicp": {"own"}, "vgicp_on_our_scans": {"ours"}}
+
+
+def test_what_vgicp_said_of_our_scans_is_kept_under_the_program_and_those_scans(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(systems, "version", lambda system: "1.0")
+    recording = SimpleNamespace(name="a", digest="raw", deskewed_digest="flat")
+    kept = result("a", "small_gicp").outcome
+    kept.write(tmp_path / "a_small_gicp_1.0_scans=ours-voxel_m=0.5_flat.npz")
+    kept.write(tmp_path / "a_small_gicp_1.0_scans=own-voxel_m=0.5_raw.npz")
+    runner = Runner(tmp_path)
+    for system in ("small_gicp", "vgicp_on_our_scans"):
+        found = runner.outcome(system, recording, VARIANTS[system]["0.5m"])
+        assert np.array_equal(found.T, kept.T)
+
+
+def test_time_of_the_sensor_check_is_told_once_it_was_taken() -> None:
+    without = Outcome(np.zeros(4, np.int64), np.tile(np.eye(4), (4, 1, 1)), np.ones(4), 1.0, 1)
+    assert not [*scores.sensors(without)]
+    without.extra["sensors_ms"] = np.array(100.0)
+    said = {score.name: score.value for score in scores.sensors(without)}
+    assert said == {"sensors_ms_per_session": 100.0, "sensors_ms_per_scan": 25.0}
 
 
 def test_sequences_by_name(tmp_path: Path) -> None:
