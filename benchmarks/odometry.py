@@ -35,7 +35,7 @@ QUICK = ("town_32", "kitti_raw_0005")
 PREFIX = "bench.odometry"
 PAIRS = 2000
 
-console = Console(stderr=True, width=200)
+console = Console(stderr=True, width=240)
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -165,7 +165,7 @@ def _show(
         Path(options.json or options.out / "odometry.json").write_text(text + "\n")
     if options.page:
         page.fill(options.page, rows, _remark(seconds))
-    screen = console if options.json == "-" else Console(width=200)
+    screen = console if options.json == "-" else Console(width=240)
     screen.print(display.comparison(chosen))
     screen.print(display.summary(figures))
     screen.print(f"picture: {options.out / 'odometry.png'}; {seconds:.0f} s")
