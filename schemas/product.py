@@ -486,6 +486,7 @@ def _from_arrow(chunked: pa.ChunkedArray, spec: Column, name: str, where: str) -
     if spec.shape:
         array = array.flatten()
     flat: np.ndarray = array.to_numpy(zero_copy_only=False)
+    flat.setflags(write=False)  # else it would depend on the size of a file whether its arrays can be written
     return flat.reshape(-1, *spec.shape) if spec.shape else flat
 
 

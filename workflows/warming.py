@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import tempfile
+from itertools import islice
 from pathlib import Path
 
+import numpy as np
+
+from scanloom.pipeline.run import Result
+from scanloom.schemas.errors import StageError
+from scanloom.schemas.scans import Scans
 from scanloom.stages.geometry.kernels import cache_folder, remember_signatures
 from scanloom.workflows.build_map import Order, build_map
 from scanloom.workflows.sessions import SAMPLE
 
 MARKER = "warm"
+BARE_SCANS = 12
 
 
 def is_warm() -> bool:
@@ -18,18 +25,37 @@ def is_warm() -> bool:
 
 
 def warm_kernels() -> None:
-    """Map the small sample in a throwaway store; the compiled kernels stay."""
+    """Map the small sample, and a few of its scans as a log of nothing but points; the compiled kernels stay."""
     with tempfile.TemporaryDirectory(prefix="scanloom-warm-") as scratch:
-        order = Order(
-            sessions=(SAMPLE,),
-            out=Path(scratch) / "map",
-            name=SAMPLE,
-            store=Path(scratch) / "store",
-            cluster="none",
-            command_line={"simulate": {"size": "small"}},
-        )
-        outcome = build_map(order)
-    for _, error in outcome.failures:
-        raise error
+        folder = Path(scratch)
+        sample = _map(SAMPLE, folder)
+        _map(str(_bare_points(sample, folder / "bare")), folder)
     remember_signatures()
     (cache_folder() / MARKER).touch()
+
+
+def _map(session: str, folder: Path) -> Result:
+    order = Order(
+        sessions=(session,),
+        out=folder / "maps" / Path(session).name,
+        name=Path(session).name,
+        store=folder / "store",
+        cluster="none",
+        command_line={"simulate": {"size": "small"}},
+    )
+    outcome = build_map(order)
+    for _, error in outcome.failures:
+        raise error
+    if outcome.result is None:
+        raise StageError(f"{session} was not mapped", next_step="run `scanloom map sample` to see why")
+    return outcome.result
+
+
+def _bare_points(sample: Result, folder: Path) -> Path:
+    """Scans as KITTI stores them: points without times and beams, no other sensor. What that asks for is compiled, too."""
+    data = folder / "velodyne_points" / "data"
+    data.mkdir(parents=True)
+    for n, scan in enumerate(islice(iter(sample.parts(Scans)[0]), BARE_SCANS)):
+        points = np.column_stack((scan.x_m, scan.y_m, scan.z_m, scan.intensity))
+        points.astype("<f4").tofile(data / f"{n:010d}.bin")
+    return folder

@@ -54,7 +54,10 @@ class Points(NamedTuple):
     z_m: NDArray[np.float32]
 
     def take(self, rows: slice | NDArray[np.int64]) -> Points:
-        return Points(self.stamp_ns[rows], self.x_m[rows], self.y_m[rows], self.z_m[rows])
+        """These points, each column without gaps: kernels are compiled for that."""
+        stamp_ns = np.ascontiguousarray(self.stamp_ns[rows])
+        x, y, z = self.x_m[rows], self.y_m[rows], self.z_m[rows]
+        return Points(stamp_ns, np.ascontiguousarray(x), np.ascontiguousarray(y), np.ascontiguousarray(z))
 
 
 @dataclass(frozen=True)
