@@ -24,7 +24,7 @@ class Settings(BaseModel):
         0.7, ge=0.1, le=5.0, description="the same where scans are dense enough for surfaces of this size, m"
     )
     dense_source_voxel_m: float = Field(
-        0.85, ge=0.05, le=10.0, description="what dense scans are thinned to before they are registered, m"
+        1.0, ge=0.05, le=10.0, description="what dense scans are thinned to before they are registered, m"
     )
     dense_share: float = Field(
         0.145,
