@@ -167,7 +167,7 @@ def _ramp(inside: NDArray[np.bool_], ticks: int) -> F8:
 
 def _recently(flag: NDArray[np.bool_], ticks: int) -> NDArray[np.bool_]:
     """True from a raised flag on for a number of ticks."""
-    reach = np.convolve(flag.astype(float), np.ones(ticks + 1))[: len(flag)]
+    reach = np.convolve(np.append(flag, False).astype(float), np.ones(ticks + 1))[: len(flag)]
     return np.asarray(reach > 0)
 
 
@@ -177,6 +177,6 @@ def _correlated(rng: np.random.Generator, count: int, ticks: int) -> F8:
 
     a = np.exp(-1.0 / ticks)
     white = np.sqrt(1 - a * a) * rng.standard_normal((count, 3))
-    white[0] /= np.sqrt(1 - a * a)
+    white[:1] /= np.sqrt(1 - a * a)
     out: F8 = lfilter([1.0], [1.0, -a], white, axis=0)
     return out

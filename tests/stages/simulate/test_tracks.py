@@ -87,6 +87,13 @@ def test_gnss_lies_by_metres_with_a_good_status(driven: tuple[Motion, GnssTrack]
     assert off[good].max() < 25.0
 
 
+def test_without_a_receiver_there_are_no_fixes(driven: tuple[Motion, GnssTrack]) -> None:
+    motion, _ = driven
+    town = build_town(0, 0)
+    none = gnss_track(LAP.model_copy(update={"duration_s": 0.0}), motion, scene_of(town.triangles()[0]))
+    assert len(none.t) == 0
+
+
 def test_gnss_is_silent_in_the_tunnel(driven: tuple[Motion, GnssTrack]) -> None:
     motion, track = driven
     x, y = motion.poses(track.t)[:, 0, 3], motion.poses(track.t)[:, 1, 3]
