@@ -10,6 +10,7 @@ import shutil
 import socket
 import uuid
 from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -167,7 +168,8 @@ class Store:
         with _writing(folder):
             folder.mkdir()
         try:
-            yield Draft(self, folder, stage, key)
+            with Draft(self, folder, stage, key) as draft:
+                yield draft
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
@@ -205,14 +207,22 @@ class Draft:
         self._store = store
         self._stage = stage
         self._key = key
-        self._parts: dict[tuple[str, str | None], StoredPart] = {}
+        self._parts: dict[tuple[str, str | None], Future[StoredPart]] = {}
+        self._sealer = ThreadPoolExecutor(1, "seal")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._sealer.shutdown(cancel_futures=True)
 
     @property
     def parts(self) -> list[StoredPart]:
-        return [self._parts[name] for name in sorted(self._parts, key=lambda n: (n[0], n[1] or ""))]
+        """What was written, once it is on the disk."""
+        return [self._parts[name].result() for name in sorted(self._parts, key=lambda n: (n[0], n[1] or ""))]
 
-    def write(self, product: Product, key: str | None) -> StoredPart:
-        """Write one product, or one part of it, with its digest; flushed to the disk."""
+    def write(self, product: Product, key: str | None) -> None:
+        """Write one product, or one part of it. It is flushed to the disk and digested while the next is made."""
         name = (product.NAME, key)
         if name in self._parts:
             raise ProductError(f"{product.NAME} {key or ''} was written twice")
@@ -223,12 +233,15 @@ class Draft:
         with _writing(target):
             target.parent.mkdir(exist_ok=True)
             rows = product.write(target)
+        self._parts[name] = self._sealer.submit(self._sealed, type(product), key, relative, rows)
+
+    def _sealed(self, product: type[Product], key: str | None, relative: str, rows: int) -> StoredPart:
+        target = self.folder / relative
+        with _writing(target):
             files = tuple(self._seal(path) for path in _files_under(target))
         inner = {Path(f.path).relative_to(relative).as_posix(): f.sha256 for f in files}
-        content = files_digest(inner) if isinstance(product, Files) else files[0].sha256
-        part = StoredPart(product.NAME, key, relative, rows, files, content)
-        self._parts[name] = part
-        return part
+        content = files_digest(inner) if issubclass(product, Files) else files[0].sha256
+        return StoredPart(product.NAME, key, relative, rows, files, content)
 
     def publish(self, identity: Mapping[str, Any], run: Mapping[str, Any]) -> Artifact:
         """Make the artifact exist, at once and whole. When another writer was first, its artifact stands."""
