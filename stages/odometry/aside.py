@@ -40,9 +40,14 @@ class Aside:
         return self.scans >= ENOUGH_SCANS
 
 
+def untold(pause_s: float) -> F8:
+    """Covariance (6, 6) of a motion that nothing tells, (rad, m): the longer the pause, the farther it may have gone."""
+    return np.diag([UNKNOWN_RAD**2] * 3 + [(UNKNOWN_M + UNKNOWN_M_S * pause_s) ** 2] * 3)
+
+
 def unknown_motion(prediction: Prediction, pause_s: float) -> F8:
     """Covariance (6, 6) of a motion that neither sensors nor scans tell; a gyro's word on the turn is kept."""
-    covariance = np.diag([UNKNOWN_RAD**2] * 3 + [(UNKNOWN_M + UNKNOWN_M_S * pause_s) ** 2] * 3)
+    covariance = untold(pause_s)
     turn = prediction.covariance[:3, :3]
     if turn.diagonal().max() < SURE_TURN_RAD**2:
         covariance[:3, :3] = turn

@@ -11,13 +11,14 @@ import dataclasses
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from scanloom.stages.geometry.degeneracy import judge
 from scanloom.stages.geometry.registration import VoxelMap, align
 from scanloom.stages.geometry.se3 import F8, adjoint, inverse, se3_exp, se3_log, transform
-from scanloom.stages.odometry.aside import UNKNOWN_M, UNKNOWN_M_S, UNKNOWN_RAD
+from scanloom.stages.odometry.aside import untold
 from scanloom.stages.odometry.rows import Row
 from scanloom.stages.odometry.settings import Settings
 from scanloom.stages.odometry.windows import Window
@@ -64,7 +65,7 @@ def _continued(settings: Settings, joined: list[Row], before: Tracked, after: Tr
     seam = seam_of(settings, before, after)
     T_end = last.T_odom_lidar @ (seam.T if seam else np.eye(4))
     T_first_after = T_end @ inverse(end.T_odom_lidar)
-    covariance = _unknown(first.stamp_ns - last.stamp_ns)
+    covariance = untold(1e-9 * (first.stamp_ns - last.stamp_ns))
     if seam is not None:
         A = adjoint(inverse(first.T_odom_lidar) @ end.T_odom_lidar)
         covariance = A @ seam.covariance @ A.T + first.covariance
@@ -92,16 +93,14 @@ def seam_of(settings: Settings, before: Tracked, after: Tracked) -> Seam | None:
         return None
     points = _cloud(after, theirs[-1])
     T_before_end = ours[-1].T_odom_lidar
-    found = align(
-        before.map, points, T_before_end @ mean.T, max_distance_m=before.map.voxel_size_m, scale_m=SCALE_M,
+    lay = partial(
+        align, before.map, points, T_before_end @ mean.T, max_distance_m=before.map.voxel_size_m, scale_m=SCALE_M,
         max_iterations=settings.max_iterations,
     )  # fmt: skip
+    found = lay()
     seen = judge(found, point_noise_m=settings.point_noise_m, snr=settings.snr)
     if (seen.p < settings.least_p).any():
-        found = align(
-            before.map, points, T_before_end @ mean.T, max_distance_m=before.map.voxel_size_m, scale_m=SCALE_M,
-            max_iterations=settings.max_iterations, free=seen.observed(settings.least_p),
-        )  # fmt: skip
+        found = lay(free=seen.observed(settings.least_p))
     T = inverse(T_before_end) @ found.T_target_source
     off = se3_log(inverse(mean.T) @ T)
     far = np.linalg.norm(off[3:]) > FARTHEST_M or np.linalg.norm(off[:3]) > FARTHEST_RAD
@@ -109,8 +108,7 @@ def seam_of(settings: Settings, before: Tracked, after: Tracked) -> Seam | None:
         return mean
     information = seen.scan_information(settings.least_p, settings.covariance_inflation)
     covariance = np.linalg.inv(information + np.linalg.inv(mean.covariance))
-    floor = np.diag([settings.floor_rad**2] * 3 + [settings.floor_m**2] * 3)
-    return Seam(T, 0.5 * (covariance + covariance.T) + floor)
+    return Seam(T, 0.5 * (covariance + covariance.T) + settings.floor)
 
 
 def _mean(ours: Sequence[Row], theirs: Sequence[Row]) -> Seam | None:
@@ -145,8 +143,3 @@ def _cloud(after: Tracked, end: Row) -> F8:
         for row, points in after.kept
     ]
     return np.concatenate(clouds) if clouds else np.zeros((0, 3))
-
-
-def _unknown(pause_ns: int) -> F8:
-    std_m = UNKNOWN_M + UNKNOWN_M_S * 1e-9 * pause_ns
-    return np.diag([UNKNOWN_RAD**2] * 3 + [std_m**2] * 3)

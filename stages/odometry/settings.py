@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from scanloom.stages.geometry.degeneracy import Indicator
+from scanloom.stages.geometry.se3 import F8
 
 
 class Settings(BaseModel):
@@ -108,3 +110,8 @@ class Settings(BaseModel):
     )
     floor_m: float = Field(0.0005, ge=0.0, le=1.0, description="least standard deviation of translation, m")
     floor_rad: float = Field(0.00003, ge=0.0, le=0.1, description="least standard deviation of rotation, rad")
+
+    @property
+    def floor(self) -> F8:
+        """Least covariance (6, 6) of a motion, (rad, m)."""
+        return np.diag([self.floor_rad**2] * 3 + [self.floor_m**2] * 3)

@@ -56,7 +56,7 @@ class Tracker:
         self.inserted_T = np.eye(4)
         self.dropped_m = np.zeros(3)
         self.recovery = Recovery(T_base_lidar)
-        self.floor: F8 = np.diag([settings.floor_rad**2] * 3 + [settings.floor_m**2] * 3)
+        self.floor = settings.floor
         self.belief = Belief(self.floor)
         self.fruitless = 0
         self.aside: Aside | None = None
