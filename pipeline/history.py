@@ -49,8 +49,9 @@ class History:
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """What changed between two identities, in words."""
+    settings_of = new.get("settings_of", new.get("stage"))
     return [
-        *_settings("settings." + str(new.get("stage")), old.get("settings", {}), new.get("settings", {})),
+        *_settings(f"settings.{settings_of}", old.get("settings", {}), new.get("settings", {})),
         *_code(old.get("code", {}), new.get("code", {}), str(new.get("stage"))),
         *_inputs(old.get("inputs"), new.get("inputs")),
         *(["layout of the store"] if old.get("schema") != new.get("schema") else []),

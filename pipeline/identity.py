@@ -77,11 +77,14 @@ class Identifier:
 
     def constant(self, task: Task) -> Json:
         """The part of the identity that does not depend on inputs: stage, code, settings."""
+        node = task.node
+        shared = {} if node.settings_of == node.name else {"settings_of": node.settings_of}
         return {
             "schema": SCHEMA,
-            "stage": task.node.name,
-            "code": self._code_of(task.node),
+            "stage": node.name,
+            "code": self._code_of(node),
             "settings": task.settings.model_dump(mode="json"),
+            **shared,
         }
 
     def changed_sources(self, inputs: list[Input]) -> list[str]:

@@ -16,6 +16,7 @@ AXES: dict[str, tuple[str, ...]] = {
     "map": (),
     "session": ("session",),
     "chunk": ("session", "chunk"),
+    "window": ("session", "window"),
     "submap": ("session", "submap"),
     "tile": ("tile",),
     "pair": ("pair",),
@@ -42,6 +43,8 @@ class Node:
     settings: type[BaseModel]
     version: int
     title: str
+    settings_of: str
+    """Name under which its settings stand: its own, or that of the stage it shares them with."""
     only: str | None = None
     """Runs for sessions with this tag only (for instance `simulated`)."""
     resources: tuple[tuple[str, float], ...] = ()
@@ -60,13 +63,15 @@ def node(
     reads: tuple[type[Product], ...] = (),
     writes: type[Product] | tuple[type[Product], ...],
     title: str = "",
+    settings: str = "",
     only: str | None = None,
     resources: Mapping[str, float] | None = None,
 ) -> Node:
     """Declare a line of a workflow.
 
     `stage(settings, *products)` gets its products in the order of `reads`, and returns a product, a tuple of products,
-    or an iterator of products and `Part`s; each is written before the next is asked for.
+    or an iterator of products and `Part`s; each is written before the next is asked for. With `settings`, its settings
+    stand under that name, usually another stage's of the same `Settings`: what is set there holds for both.
 
     Raises
     ------
@@ -76,9 +81,11 @@ def node(
         raise UsageError(f"node {name}: per={per!r} is none of {', '.join(AXES)}")
     module = sys.modules[stage.__module__]
     try:
-        settings, version = module.Settings, module.VERSION
+        model, version = module.Settings, module.VERSION
     except AttributeError as error:
         raise UsageError(f"node {name}: module {stage.__module__} lacks Settings or VERSION") from error
     outputs = writes if isinstance(writes, tuple) else (writes,)
     needs = tuple(sorted((resources or {}).items()))
-    return Node(name, stage, per, reads, outputs, settings, version, title or name, only, needs)
+    return Node(
+        name, stage, per, reads, outputs, model, version, title or name, settings or name, only, needs
+    )

@@ -124,9 +124,9 @@ def _check_provided(
 
 
 def session_settings(request: Request, session: SessionInput) -> dict[str, BaseModel]:
-    per_session = {node.name for node in request.nodes if "session" in node.axes}
+    of_the_map = {node.settings_of for node in request.nodes if "session" not in node.axes}
     for stage in session.settings:
-        if stage not in per_session and any(node.name == stage for node in request.nodes):
+        if stage in of_the_map:
             raise UsageError(
                 f"stage {stage} runs for the whole map, so one session cannot set it",
                 where=f"session {session.name}",

@@ -16,16 +16,23 @@ Layer = tuple[str, Mapping[str, Mapping[str, Any]]]
 
 
 def resolve(nodes: Sequence[Node], layers: Sequence[Layer]) -> dict[str, BaseModel]:
-    """Settings of every stage; a later layer wins over an earlier one.
+    """Settings of every stage by its name; a later layer wins over an earlier one.
 
     Raises
     ------
     UsageError : a stage or field is unknown (the nearest known one is named), or a value is out of bounds.
     """
-    models = {node.name: node.settings for node in nodes}
+    models = _models(nodes)
+    shared = {node.name: node.settings_of for node in nodes if node.name not in models}
     merged: dict[str, dict[str, Any]] = {name: {} for name in models}
     for origin, layer in layers:
         for stage, values in layer.items():
+            if stage in shared:
+                raise UsageError(
+                    f"{stage!r} has no settings of its own",
+                    where=origin,
+                    next_step=f"set those of `{shared[stage]}`, which it uses",
+                )
             _known(stage, list(models), "stage", origin)
             if not isinstance(values, Mapping):
                 raise UsageError(
@@ -36,7 +43,20 @@ def resolve(nodes: Sequence[Node], layers: Sequence[Layer]) -> dict[str, BaseMod
             for field in values:
                 _known(str(field), list(models[stage].model_fields), f"setting of stage {stage}", origin)
             merged[stage] = _merge(merged[stage], values)
-    return {name: _validated(name, models[name], merged[name], layers) for name in models}
+    settings = {name: _validated(name, models[name], merged[name], layers) for name in models}
+    return {node.name: settings[node.settings_of] for node in nodes}
+
+
+def _models(nodes: Sequence[Node]) -> dict[str, type[BaseModel]]:
+    """Models by the name they stand under."""
+    models: dict[str, type[BaseModel]] = {}
+    for node in nodes:
+        if models.setdefault(node.settings_of, node.settings) is not node.settings:
+            raise UsageError(
+                f"node {node.name} shares the settings of {node.settings_of} but has another model",
+                next_step="both stages must have the same `Settings`",
+            )
+    return models
 
 
 def _known(name: str, known: Sequence[str], kind: str, origin: str) -> None:

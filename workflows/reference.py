@@ -78,7 +78,8 @@ def _stage_page(n: Node) -> str:
     if n.stage.__doc__:
         parts += [inspect.cleandoc(n.stage.__doc__), "\n\n"]
     parts.append(f"Runs once per {n.per}. Reads {_names(n.reads) or 'nothing'}; writes {_names(n.writes)}.\n")
-    parts += ["\n## Settings\n", _settings_table(n)]
+    shared = f"\nThose of [{n.settings_of}]({n.settings_of}.md).\n"
+    parts += ["\n## Settings\n", _settings_table(n) if n.settings_of == n.name else shared]
     return "".join(parts)
 
 

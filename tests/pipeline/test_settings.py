@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
+from scanloom.pipeline.fingerprint import digest
+from scanloom.pipeline.flow import Flow, Task
+from scanloom.pipeline.history import differences
+from scanloom.pipeline.identity import Identifier
+from scanloom.pipeline.node import node
+from scanloom.pipeline.request import Request
 from scanloom.pipeline.settings import resolve
 from scanloom.schemas.errors import EXIT_USAGE, UsageError
-from tests.pipeline.toys.workflow import NODES
+from tests.pipeline.toys.cut import cut
+from tests.pipeline.toys.products import Chunk, Info, Piece, Shift, Smooth
+from tests.pipeline.toys.smooth import smooth
+from tests.pipeline.toys.workflow import NODES, log
+
+
+class Gentle(Smooth):
+    NAME = "gentle"
 
 
 def test_defaults_then_layers():
@@ -47,3 +62,45 @@ def test_the_layer_at_fault_is_the_last_that_sets_the_field():
         resolve(
             NODES, [("project.yaml", {"smooth": {"step": 2}}), ("command line", {"smooth": {"step": 99}})]
         )
+
+
+# --- settings of another stage ----------------------------------------------------------------------------------------
+
+SHARING = (*NODES, node("gentle", smooth, per="chunk", reads=(Chunk, Info), writes=Gentle, settings="smooth"))
+
+
+def test_a_stage_may_use_the_settings_of_another():
+    settings = resolve(SHARING, [("command line", {"smooth": {"step": 4}})])
+    assert settings["gentle"] == settings["smooth"]
+    assert settings["gentle"].step == 4
+
+
+def test_shared_settings_are_set_where_they_stand():
+    with pytest.raises(UsageError, match="'gentle' has no settings of its own Next: set those of `smooth`"):
+        resolve(SHARING, [("command line", {"gentle": {"step": 4}})])
+
+
+def test_stages_that_share_settings_have_the_same_model():
+    wrong = node("other", cut, per="chunk", reads=(Smooth, Shift), writes=Piece, settings="smooth")
+    with pytest.raises(UsageError, match="node other shares the settings of smooth but has another model"):
+        resolve((*NODES, wrong), [])
+
+
+def test_shared_settings_are_part_of_the_key_and_named_in_the_reason(tmp_path, store):
+    a = log(tmp_path, "a", range(30))
+    first = Flow(Request(SHARING[:3] + SHARING[-1:], (a,)))
+    second = Flow(Request(SHARING[:3] + SHARING[-1:], (a,), {"smooth": {"step": 4}}))
+    old, new = (
+        Identifier(flow, store).constant(Task(SHARING[-1], (), flow.settings(SHARING[-1], "a")))
+        for flow in (first, second)
+    )
+    assert new["settings"]["step"] == 4
+    assert digest(old) != digest(new)
+    assert differences(old, new) == ["settings.smooth.step 1 -> 4"]
+
+
+def test_one_session_cannot_set_what_a_stage_of_the_map_shares(tmp_path):
+    a = dataclasses.replace(log(tmp_path, "a", range(30)), settings={"smooth": {"step": 2}})
+    of_the_map = node("whole", smooth, per="map", reads=(Chunk, Info), writes=Gentle, settings="smooth")
+    with pytest.raises(UsageError, match="stage smooth runs for the whole map"):
+        Flow(Request((*NODES, of_the_map), (a,)))
