@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8, pose, so3_exp
 from scanloom.stages.geometry.voxels import Int
+from scanloom.stages.odometry.poses import apart
 
 U1 = NDArray[np.uint8]
 I4 = NDArray[np.int32]
@@ -142,16 +143,15 @@ def _least(found: list[Proposal], most: int) -> float:
 
 def _keep(found: list[Proposal], new: Proposal, most: int) -> None:
     """Put a proposal where it belongs, unless a better one is near; worse ones near it go."""
-    if any(p.score >= new.score and not _apart(p.T_map_scan, new.T_map_scan) for p in found):
+    if any(p.score >= new.score and not _distinct(p, new) for p in found):
         return
-    found[:] = [p for p in found if _apart(p.T_map_scan, new.T_map_scan)]
+    found[:] = [p for p in found if _distinct(p, new)]
     found.insert(next((k for k, p in enumerate(found) if p.score < new.score), len(found)), new)
     del found[most:]
 
 
-def _apart(a: F8, b: F8) -> bool:
-    cosine = 0.5 * (np.trace(a[:3, :3].T @ b[:3, :3]) - 1)
-    return bool(np.linalg.norm(a[:3, 3] - b[:3, 3]) > DISTINCT_M or cosine < np.cos(DISTINCT_RAD))
+def _distinct(a: Proposal, b: Proposal) -> bool:
+    return apart(a.T_map_scan, b.T_map_scan, DISTINCT_M, DISTINCT_RAD)
 
 
 @kernel

@@ -15,6 +15,7 @@ import numpy as np
 from scanloom.stages.geometry.registration import Registration
 from scanloom.stages.geometry.se3 import F8, inverse, so3_log
 from scanloom.stages.odometry.coarse import Window, headings, propose, rotations
+from scanloom.stages.odometry.poses import apart
 from scanloom.stages.odometry.prediction import Prediction
 
 UPRIGHT_COSINE = 0.8
@@ -108,7 +109,8 @@ class Recovery:
         direct = max(tries, key=merit) if tries else None
         if direct is not None and merit(direct) >= LEAST_AHEAD * top:
             return Attempt(direct, searched=False, believed=merit(direct) >= LEAST_EXPECTED * self.usual)
-        rivals = [merit(r) for r in (*tries, *found) if _apart(r.T_target_source, best.T_target_source)]
+        T_best = best.T_target_source
+        rivals = [merit(r) for r in (*tries, *found) if apart(r.T_target_source, T_best, APART_M, APART_RAD)]
         alone = max(rivals, default=0.0) < MOST_OF_BEST * top
         believed = not self.usual or (alone and top >= LEAST_SURPRISING * self.usual)
         return Attempt(best, searched=True, believed=believed, sure=alone and top >= DOUBTFUL * self.usual)
@@ -138,8 +140,3 @@ def _likelihood(T: F8, T_expected: F8) -> float:
 
 def _distance(a: F8, b: F8) -> float:
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
-
-
-def _apart(a: F8, b: F8) -> bool:
-    turn = so3_log((inverse(a) @ b)[:3, :3])
-    return bool(_distance(a, b) > APART_M or np.linalg.norm(turn) > APART_RAD)

@@ -12,6 +12,7 @@ from scanloom.stages.geometry.registration import Registration, VoxelMap, align
 from scanloom.stages.geometry.se3 import F8, inverse, se3_log, transform
 from scanloom.stages.odometry.aside import Aside, Unconfirmed, unknown_motion
 from scanloom.stages.odometry.belief import Belief
+from scanloom.stages.odometry.poses import apart, orthonormal
 from scanloom.stages.odometry.prediction import Prediction, Predictor, forward_guesses
 from scanloom.stages.odometry.recovery import Attempt, Recovery
 from scanloom.stages.odometry.rows import Row, Rows
@@ -305,7 +306,7 @@ class Tracker:
                 self.rows.split(len(self.rows) - 1, unknown_motion(prediction, pause_s))
             self.rows.sure = len(self.rows) - 1
             self._start_anew(self._new_map())
-        elif not in_map or self.unconfirmed is not None or not moved(
+        elif not in_map or self.unconfirmed is not None or not apart(
             self.inserted_T, self.T, self.settings.insert_m, self.settings.insert_rad
         ):  # fmt: skip
             return
@@ -322,7 +323,7 @@ class Tracker:
 
     def _is_keyframe(self, stamp_ns: int) -> bool:
         late = stamp_ns - self.keyframe_ns >= self.settings.keyframe_s * 1e9
-        if not late and not moved(
+        if not late and not apart(
             self.keyframe_T, self.T, self.settings.keyframe_m, self.settings.keyframe_rad
         ):
             return False
@@ -377,17 +378,3 @@ class RunningDeviation:
         keep = min(1.0, self.MEMORY / (self._count + 1))
         self._square_sum = (self._square_sum + float(off) ** 2) * keep
         self._count = (self._count + 1) * keep
-
-
-def moved(T_a: F8, T_b: F8, distance_m: float, angle_rad: float) -> bool:
-    """Whether two poses are at least this far or this much turned from each other."""
-    xi = se3_log(inverse(T_a) @ T_b)
-    return bool(np.linalg.norm(T_a[:3, 3] - T_b[:3, 3]) >= distance_m or np.linalg.norm(xi[:3]) >= angle_rad)
-
-
-def orthonormal(T: F8) -> F8:
-    """The pose with rounding removed from its rotation."""
-    left, _, right = np.linalg.svd(T[:3, :3])
-    out = T.copy()
-    out[:3, :3] = left @ right
-    return out
