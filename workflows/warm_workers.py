@@ -16,7 +16,7 @@ from scanloom.pipeline.task import at_work
 from scanloom.stages.geometry.kernels import load_kernels
 
 LATER = ("scipy.special", "gtsam", "scipy.spatial", "scipy.ndimage", "pyproj")
-"""What fusion, evaluation and report import inside their functions, in the order of its use."""
+"""What fusion, evaluation and report import inside their functions, in the order they are used."""
 PAUSE_S = 0.02
 
 
