@@ -60,11 +60,12 @@ def evaluation(
     truths = {c["session"]: t for c, t in truth.items() if len(t)}
     odometries = {c["session"]: o for c, o in odometry.items()}
     optimised = {c["session"]: p for c, p in poses.items()}
-    checks = {c["session"]: (found,) for c, found in check.items()} if check is not None else {}
+    checks = {c["session"]: found for c, found in check.items()} if check is not None else {}
     figures: list[Figure] = []
     for name in sorted(odometries.keys() & optimised.keys()):
         figures += _of(name, trajectory_figures(odometries[name], optimised[name]))
-        figures += [f for found in checks.get(name, ()) for f in _of(name, sensor_figures(found))]
+        if name in checks:
+            figures += _of(name, sensor_figures(checks[name]))
         if name in truths:
             figures += _of(name, truth_figures(truths[name], odometries[name], optimised[name]))
             track = error_track(truths[name], odometries[name], optimised[name])
