@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from benchmarks.scores import Score
-from scanloom.schemas.scans import Scan, Scans
+from scanloom.schemas.scans import DeskewedScan, Scan, Scans
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.stages.deskew import Settings, deskew
@@ -94,7 +94,7 @@ def range_differences(folder: Path, i: int) -> F8:
     return difference
 
 
-def _at_rest(scan: Scan) -> Scan:
+def _at_rest(scan: Scan) -> DeskewedScan:
     (out,) = deskew(Settings(), Scans([scan]), _session(), Imu.empty(), Wheel.empty())
     return out
 

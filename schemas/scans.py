@@ -25,8 +25,20 @@ class PointClass(IntEnum):
     OUT_OF_RANGE = 7
 
 
+class Cloud:
+    """Points with coordinates in columns of their own."""
+
+    x_m: NDArray[np.float32]
+    y_m: NDArray[np.float32]
+    z_m: NDArray[np.float32]
+
+    def points(self) -> NDArray[np.float32]:
+        """(n, 3) coordinates in the LiDAR frame, metres."""
+        return np.column_stack((self.x_m, self.y_m, self.z_m))
+
+
 @dataclass(frozen=True)
-class Scan(Table):
+class Scan(Cloud, Table):
     """One sweep of a LiDAR as measured; coordinates at each point's own time. Points without return are not kept."""
 
     NAME: ClassVar[str] = "scan"
@@ -41,16 +53,23 @@ class Scan(Table):
     reference_ns: int = attribute("reference time of the scan: the middle of its sweep, ns")
     scan_index: int = attribute("number of the scan in its session, from 0")
 
-    def points(self) -> NDArray[np.float32]:
-        """(n, 3) coordinates in the LiDAR frame, metres."""
-        return np.column_stack((self.x_m, self.y_m, self.z_m))
-
 
 @dataclass(frozen=True)
-class DeskewedScan(Scan):
-    """One sweep with all points expressed in the LiDAR frame at `reference_ns`; same points, same order."""
+class DeskewedScan(Cloud, Table):
+    """One sweep with all points expressed in the LiDAR frame at `reference_ns`.
+
+    Same points in the same order as the scan, which keeps what else was measured of them: every later stage reads this.
+    """
 
     NAME: ClassVar[str] = "deskewed_scan"
+    SCHEMA_VERSION: ClassVar[int] = 2
+
+    x_m: NDArray[np.float32] = column("f4", "forward", unit="m", frame="lidar")
+    y_m: NDArray[np.float32] = column("f4", "left", unit="m", frame="lidar")
+    z_m: NDArray[np.float32] = column("f4", "up", unit="m", frame="lidar")
+    intensity: NDArray[np.float32] = column("f4", "strength of the return as the sensor reports it")
+    reference_ns: int = attribute("time at which the LiDAR's frame is meant: the middle of the sweep, ns")
+    scan_index: int = attribute("number of the scan in its session, from 0")
 
 
 class Scans(Stream[Scan]):
@@ -65,6 +84,7 @@ class Deskewed(Stream[DeskewedScan]):
     """The deskewed scans of one chunk."""
 
     NAME = "deskewed"
+    SCHEMA_VERSION = 2
     ITEM = DeskewedScan
 
 

@@ -6,7 +6,6 @@ with its neighbours in the chunk. Source: methods 1.4 (Ren et al. 2021, step b; 
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
@@ -17,7 +16,7 @@ from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Scan, Scans
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
-from scanloom.stages.geometry.compensation import compensate
+from scanloom.stages.geometry.compensation import F4, compensate
 from scanloom.stages.geometry.motion import MotionTrack, Twists
 from scanloom.stages.geometry.neighbours import ThinScan, twist_between
 from scanloom.stages.geometry.rig import corrected
@@ -68,7 +67,7 @@ def deskew(
         max_gyro_gap_s=settings.max_gyro_gap_s, max_wheel_gap_s=settings.max_wheel_gap_s,
     )  # fmt: skip
     if settings.motion == "none" or session.point_time == "none":
-        return Deskewed(_renamed(scan) for scan in scans)
+        return Deskewed(_seen_at_once(scan, scan.x_m, scan.y_m, scan.z_m) for scan in scans)
     twists = _Neighbours(track) if settings.motion == "auto" else None
     return Deskewed(_compensated(scans, track, twists))
 
@@ -77,7 +76,7 @@ def _compensated(scans: Scans, track: MotionTrack, neighbours: _Neighbours | Non
     for scan, following in _with_next(scans):
         twist = neighbours.twist(scan, following) if neighbours else None
         x, y, z = compensate(scan.stamp_ns, scan.x_m, scan.y_m, scan.z_m, scan.reference_ns, track, twist)
-        yield _renamed(dataclasses.replace(scan, x_m=x, y_m=y, z_m=z))
+        yield _seen_at_once(scan, x, y, z)
 
 
 class Pair(NamedTuple):
@@ -146,6 +145,7 @@ def _with_next(scans: Scans) -> Iterator[tuple[Scan, Scan | None]]:
         yield current, None
 
 
-def _renamed(scan: Scan) -> DeskewedScan:
-    fields = {f.name: getattr(scan, f.name) for f in dataclasses.fields(scan)}
-    return DeskewedScan(**fields)
+def _seen_at_once(scan: Scan, x: F4, y: F4, z: F4) -> DeskewedScan:
+    return DeskewedScan(
+        x_m=x, y_m=y, z_m=z, intensity=scan.intensity, reference_ns=scan.reference_ns, scan_index=scan.scan_index
+    )  # fmt: skip

@@ -72,7 +72,7 @@ def observe(
     ranges = world.ranges(origin, rays @ T_world_lidar[:3, :3].T)
     if rng is not None:
         ranges = ranges + rng.normal(0, noise_m, len(ranges))
-    return _scan(rays, ranges, np.arange(len(rays)) // rows, rows, columns, stamp_ns, index, DeskewedScan)
+    return at_once(_scan(rays, ranges, np.arange(len(rays)) // rows, rows, columns, stamp_ns, index))
 
 
 def sweep(
@@ -87,7 +87,7 @@ def sweep(
     ranges = world.ranges(T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], rays))
     if rng is not None:
         ranges = ranges + rng.normal(0, noise_m, len(ranges))
-    return _scan(rays, ranges, column, rows, columns, stamp_ns, index, Scan, period_s)
+    return _scan(rays, ranges, column, rows, columns, stamp_ns, index, period_s)
 
 
 def sweep_along(
@@ -102,18 +102,26 @@ def sweep_along(
     ranges = world.ranges(T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], rays))
     if rng is not None:
         ranges = ranges + rng.normal(0, noise_m, len(ranges))
-    return _scan(rays, ranges, column, rows, columns, stamp_ns, index, Scan, period_s)
+    return _scan(rays, ranges, column, rows, columns, stamp_ns, index, period_s)
+
+
+def at_once(scan: Scan) -> DeskewedScan:
+    """The scan as if the LiDAR had stood still, or of a LiDAR that did."""
+    return DeskewedScan(
+        x_m=scan.x_m, y_m=scan.y_m, z_m=scan.z_m, intensity=scan.intensity, reference_ns=scan.reference_ns,
+        scan_index=scan.scan_index,
+    )  # fmt: skip
 
 
 def _scan(
     rays: F8, ranges: F8, column: NDArray[np.int64], rows: int, columns: int, stamp_ns: int, index: int,
-    kind: type[Scan], period_s: float = 0.1,
+    period_s: float = 0.1,
 ) -> Scan:  # fmt: skip
     hit = np.isfinite(ranges)
     xyz = (rays * np.where(hit, ranges, 0)[:, None])[hit].astype(np.float32)
     dt = (column[hit] / columns - 0.5) * period_s * 1e9
     ring = np.tile(np.arange(rows), columns)[hit].astype(np.uint16)
-    return kind(
+    return Scan(
         stamp_ns=stamp_ns + dt.astype(np.int64),
         x_m=xyz[:, 0].copy(), y_m=xyz[:, 1].copy(), z_m=xyz[:, 2].copy(),
         intensity=np.full(len(xyz), 0.3, np.float32), ring=ring, return_no=np.zeros(len(xyz), np.uint8),

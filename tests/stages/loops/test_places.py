@@ -25,8 +25,8 @@ def of_points(points: list[list[float]], classes: list[int]) -> np.ndarray:
     p = np.array(points, np.float32)
     n = len(p)
     scan = DeskewedScan(
-        stamp_ns=np.zeros(n, np.int64), x_m=p[:, 0].copy(), y_m=p[:, 1].copy(), z_m=p[:, 2].copy(),
-        intensity=np.zeros(n, np.float32), ring=np.zeros(n, np.uint16), return_no=np.zeros(n, np.uint8), reference_ns=0,
+        x_m=p[:, 0].copy(), y_m=p[:, 1].copy(), z_m=p[:, 2].copy(),
+        intensity=np.zeros(n, np.float32), reference_ns=0,
         scan_index=0,
     )  # fmt: skip
     return scan_context(

@@ -215,8 +215,8 @@ def test_kitti_path_length(shared_data: Path) -> None:
         stamp = k * 103_500_000
         scans.append(
             DeskewedScan(
-                stamp_ns=np.full(n, stamp), x_m=xyzr[:, 0].copy(), y_m=xyzr[:, 1].copy(), z_m=xyzr[:, 2].copy(),
-                intensity=xyzr[:, 3].copy(), ring=np.zeros(n, np.uint16), return_no=np.zeros(n, np.uint8),
+                x_m=xyzr[:, 0].copy(), y_m=xyzr[:, 1].copy(), z_m=xyzr[:, 2].copy(),
+                intensity=xyzr[:, 3].copy(),
                 reference_ns=stamp, scan_index=k,
             )
         )  # fmt: skip

@@ -21,8 +21,8 @@ def cloud(points: F8, index: int = 0, intensity: float = 0.5) -> DeskewedScan:
     xyz = np.asarray(points, np.float32).reshape(-1, 3)
     n = len(xyz)
     return DeskewedScan(
-        stamp_ns=np.zeros(n, np.int64), x_m=xyz[:, 0].copy(), y_m=xyz[:, 1].copy(), z_m=xyz[:, 2].copy(),
-        intensity=np.full(n, intensity, np.float32), ring=np.zeros(n, np.uint16), return_no=np.zeros(n, np.uint8),
+        x_m=xyz[:, 0].copy(), y_m=xyz[:, 1].copy(), z_m=xyz[:, 2].copy(),
+        intensity=np.full(n, intensity, np.float32),
         reference_ns=int(stamps(index + 1)[-1]), scan_index=index,
     )  # fmt: skip
 
