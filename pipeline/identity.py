@@ -103,16 +103,16 @@ class Identifier:
     def knows_sources(self) -> bool:
         """Whether the store has seen all logs before; if not, there is work to do."""
         sources = [files for session in self._flow.sessions.values() for files in session.sources.values()]
-        return self._store.hashes.knows(_root(files) / name for files in sources for name in files.names)
+        if any(_homeless(files) for files in sources):
+            return False
+        return self._store.hashes.knows(path for files in sources for path in _paths(files))
 
     def session_bytes(self, task: Task) -> int:
         """Size of the files that the task's session brings along; 0 for tasks of the whole map."""
         session = task.session
         if session not in self._bytes:
             sources = self._flow.sessions[session].sources.values() if session is not None else ()
-            self._bytes[session] = sum(
-                _stamp(_root(files) / name)[0] for files in sources for name in files.names
-            )
+            self._bytes[session] = sum(_stamp(path)[0] for files in sources for path in _paths(files))
         return self._bytes[session]
 
     def _code_of(self, node: Node) -> Json:
@@ -140,12 +140,20 @@ class Identifier:
         return self._sources[mark]
 
 
+def _homeless(files: Files) -> bool:
+    """Whether nothing tells where the files lie. The tasks that read them fail; no other task does."""
+    return files.root is None and bool(files.names)
+
+
+def _paths(files: Files) -> list[Path]:
+    """Where the files lie, as far as that is told."""
+    return [] if _homeless(files) else [_root(files) / name for name in files.names]
+
+
 def _root(files: Files) -> Path:
-    if files.root is None:
-        if files.names:
-            raise InvalidInput("source files have no folder", next_step="give Files(root=..., names=...)")
-        return Path(".").absolute()
-    return Path(files.root).absolute()
+    if _homeless(files):
+        raise InvalidInput("source files have no folder", next_step="give Files(root=..., names=...)")
+    return Path(files.root or ".").absolute()
 
 
 def _stamp(path: Path) -> tuple[int, int]:

@@ -15,7 +15,7 @@ from scanloom.schemas.errors import EXIT_INVALID_INPUT, InvalidInput, ScanloomEr
 from tests.pipeline.reading import contents, leftovers, record, verdicts
 from tests.pipeline.toys import join as join_module
 from tests.pipeline.toys import smooth as smooth_module
-from tests.pipeline.toys.products import Overview, Piece, Shift, Smooth, Summary, Tile, TileText, Track
+from tests.pipeline.toys.products import Log, Overview, Piece, Shift, Smooth, Summary, Tile, TileText, Track
 from tests.pipeline.toys.workflow import log, request
 
 A = range(30)
@@ -246,6 +246,24 @@ def test_a_missing_log_fails_its_session(tmp_path, store):
     assert isinstance(result.failures[0].error, InvalidInput)
     assert "log.txt" in str(result.failures[0].error)
     assert result.parts(Summary)[0].sessions == ("b",)
+
+
+def test_a_log_without_a_folder_fails_its_session(tmp_path, store):
+    bad = SessionInput("bad", {Log: Log(names=("log.txt",))})
+    result = run(request(log(tmp_path, "a", A), bad), store, cluster="none")
+    (failed,) = result.failures
+    assert (failed.node, failed.coordinate) == ("read", {"session": "bad"})
+    assert isinstance(failed.error, InvalidInput)
+    assert "source files have no folder" in str(failed.error)
+    assert result.parts(Summary)[0].sessions == ("a",)
+
+
+def test_a_source_without_a_folder_that_nobody_reads_does_no_harm(tmp_path, store):
+    a = log(tmp_path, "a", A)
+    more = dataclasses.replace(a, sources={**a.sources, TileText: TileText(names=("tile.txt",))})
+    result = run(request(more), store, cluster="none")
+    assert not result.failures
+    assert result.parts(Summary)[0].sessions == ("a",)
 
 
 def test_a_log_that_is_still_being_written_fails_its_session(tmp_path, store):
