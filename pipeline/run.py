@@ -116,7 +116,11 @@ def run(
 
 
 class Driver:
-    """One run. Decides the order: deepest stage first, so that chunks flow through; then the biggest session, and in it the biggest task."""
+    """One run, and the order of its tasks.
+
+    Of those that are ready the deepest stage goes first, so that chunks flow through. Of these the biggest session
+    goes first, and in it the biggest task.
+    """
 
     def __init__(
         self, request: Request, store: Store, cluster: str, workers: int | None, progress: Progress
