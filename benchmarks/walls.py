@@ -8,19 +8,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from benchmarks import handheld
 from benchmarks.scores import Score
 from scanloom.schemas.scans import DeskewedScan, Scan, Scans
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.stages.deskew import Settings, deskew
-from scanloom.stages.geometry.alignment import rms, umeyama
-from scanloom.stages.geometry.se3 import F8, pose, se3_exp, so3_log
+from scanloom.stages.geometry.alignment import rms
+from scanloom.stages.geometry.se3 import F8, se3_exp
 
 START_NS = 1_700_000_000_000_000_000
 WALL_Y_M, SPEED_M_S, TURN_DEG_S, NOISE_M = 15.0, 20.0, 30.0, 0.01
-ROWS, COLUMNS, SLICES = 32, 1024, 20
-T_NEWER_IMU_LIDAR = pose(np.diag([-1.0, -1.0, 1.0]), np.array([-0.006, 0.012, -0.029]))
-"""From the published points at the start of each sweep."""
+ROWS, COLUMNS = 32, 1024
 
 
 def scores(newer: Path | None) -> Iterator[Score]:
@@ -36,10 +35,27 @@ def scores(newer: Path | None) -> Iterator[Score]:
     same = scan.points().tobytes() == _at_rest(scan).points().tobytes()
     yield Score("identity_is_exact", float(same), "", "1 when a scan taken at rest comes out bit for bit")
     if newer is not None:
-        ranges = np.concatenate([range_differences(newer, i) for i in range(3)])
-        how = "of the difference in range to the points another tool published, three handheld scans"
-        yield Score("newer_range_median_m", float(np.median(ranges)), "m", f"median {how}")
-        yield Score("newer_range_p95_m", float(np.percentile(ranges, 95)), "m", f"95th percentile {how}")
+        yield from _real(newer)
+
+
+def _real(newer: Path) -> Iterator[Score]:
+    """Difference in range to the points another tool published, with its whole motion and with its rotation alone."""
+    sweeps = [handheld.load(newer, i) for i in range(handheld.SCANS)]
+    how = "of the difference in range to the points another tool published, three handheld scans"
+    for name, walking, motion in (
+        ("range", True, "its motion"),
+        ("turning_range", False, "its rotation alone"),
+    ):
+        ranges = np.concatenate(
+            [handheld.range_differences(s, handheld.deskewed(s, walking=walking)) for s in sweeps]
+        )
+        yield Score(f"newer_{name}_median_m", float(np.median(ranges)), "m", f"median {how}, given {motion}")
+        yield Score(
+            f"newer_{name}_p95_m",
+            float(np.percentile(ranges, 95)),
+            "m",
+            f"95th percentile {how}, given {motion}",
+        )
 
 
 def sweep_of_a_wall(twist: F8) -> Scan:
@@ -71,27 +87,6 @@ def sensors(twist: F8) -> tuple[Imu, Wheel]:
     accel = np.array([0, 0, 9.81]) + rng.normal(0, 0.02, gyro.shape)
     speed = np.where(wheel_ns > START_NS - 200_000_000, twist[3], 0.0) + rng.normal(0, 0.02, len(wheel_ns))
     return Imu(imu_ns, gyro, accel), Wheel(wheel_ns, speed, np.full(len(wheel_ns), np.nan))
-
-
-def range_differences(folder: Path, i: int) -> F8:
-    """|range deskewed - range published| (n,), m, of scan i. The motion within the sweep is read from the published
-    points, as rotation in slices of the sweep, and given as a gyro: there is no log around these scans."""
-    raw = np.fromfile(folder / f"raw_{i:02d}.bin", np.float32).reshape(-1, 3)
-    published = np.fromfile(folder / f"deskewed_{i:02d}.bin", np.float32).reshape(-1, 3).astype(float)
-    published = (published - T_NEWER_IMU_LIDAR[:3, 3]) @ T_NEWER_IMU_LIDAR[:3, :3]
-    seconds = np.fromfile(folder / f"times_{i:02d}.bin", np.float32).astype(float)
-    stamp_ns = START_NS + np.round(seconds * 1e9).astype(np.int64)
-    scan = _scan(raw, stamp_ns, START_NS + 50_000_000)
-    slot = np.minimum((seconds / seconds.max() * SLICES).astype(int), SLICES - 1)
-    middle = np.array([seconds[slot == k].mean() for k in range(SLICES)])
-    fits = [umeyama(published[slot == k], raw[slot == k].astype(float)) for k in range(SLICES)]
-    turned = np.array([so3_log(fit[:3, :3]) for fit in fits])
-    smooth = np.column_stack([np.polyval(np.polyfit(middle, turned[:, k], 2), middle) for k in range(3)])
-    gyro = np.gradient(smooth, middle, axis=0)
-    imu = Imu(START_NS + (middle * 1e9).astype(np.int64), gyro, np.tile([0.0, 0.0, 9.81], (SLICES, 1)))
-    (flat,) = deskew(Settings(), Scans([scan]), _session(), imu, Wheel.empty())
-    difference: F8 = np.abs(np.linalg.norm(flat.points(), axis=1) - np.linalg.norm(published, axis=1))
-    return difference
 
 
 def _at_rest(scan: Scan) -> DeskewedScan:
