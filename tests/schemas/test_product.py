@@ -24,6 +24,7 @@ from scanloom.schemas.product import (
     Table,
     attribute,
     column,
+    columns_of,
 )
 
 
@@ -218,6 +219,51 @@ def test_files_from_bytes_and_writers(tmp_path: Path) -> None:
     assert again.read("a/b.bin") == b"bytes"
     with pytest.raises(ProductError, match="no file"):
         again.path("../secret")
+
+
+@dataclass(frozen=True)
+class Kinds(Table):
+    """Numbers of several widths, alone and several to a cell."""
+
+    NAME: ClassVar[str] = "kinds"
+
+    stamp_ns: NDArray[np.int64] = column("i8", "when", unit="ns")
+    x_m: NDArray[np.float32] = column("f4", "where", unit="m")
+    kind: NDArray[np.uint8] = column("u1", "what")
+    sure: NDArray[np.bool_] = column("?", "whether")
+    T: NDArray[np.float64] = column("f8", "a pose", unit="m", shape=(4, 4))
+    flags: NDArray[np.bool_] = column("?", "more of that", shape=(3,))
+
+
+class ManyKinds(Stream[Kinds]):
+    """A stream of them."""
+
+    NAME = "many_kinds"
+    ITEM = Kinds
+
+
+def kinds(count: int) -> Kinds:
+    rng = np.random.default_rng(count)
+    return Kinds(
+        stamp_ns=np.arange(count, dtype=np.int64), x_m=rng.normal(size=count).astype(np.float32),
+        kind=rng.integers(0, 9, count, dtype=np.uint8), sure=rng.random(count) < 0.5,
+        T=rng.normal(size=(count, 4, 4)), flags=rng.random((count, 3)) < 0.5,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [1, 3, 200_000])
+def test_arrays_of_a_file_cannot_be_written_whatever_its_size(tmp_path: Path, count: int) -> None:
+    """Else a stage that writes into its input would work on small files only."""
+    made = kinds(count)
+    made.write(tmp_path / "kinds.parquet")
+    ManyKinds([made, made]).write(tmp_path / "many.parquet")
+    many = ManyKinds.open(tmp_path / "many.parquet")
+    for read in (Kinds.open(tmp_path / "kinds.parquet"), many[1], *many):
+        for name in columns_of(Kinds):
+            array = getattr(read, name)
+            np.testing.assert_array_equal(array, getattr(made, name))
+            with pytest.raises(ValueError, match="read-only"):
+                array[-1] = array[0]
 
 
 def test_parts_are_ordered_and_grouped() -> None:
