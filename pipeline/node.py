@@ -44,7 +44,7 @@ class Node:
     version: int
     title: str
     settings_of: str
-    """Name under which its settings stand: its own, or that of the stage it shares them with."""
+    """Stage under whose name its settings stand: itself, or another one."""
     only: str | None = None
     """Runs for sessions with this tag only (for instance `simulated`)."""
     resources: tuple[tuple[str, float], ...] = ()
@@ -70,8 +70,8 @@ def node(
     """Declare a line of a workflow.
 
     `stage(settings, *products)` gets its products in the order of `reads`, and returns a product, a tuple of products,
-    or an iterator of products and `Part`s; each is written before the next is asked for. With `settings`, its settings
-    stand under that name, usually another stage's of the same `Settings`: what is set there holds for both.
+    or an iterator of products and `Part`s; each is written before the next is asked for. With `settings`, its own
+    are those of the stage of that name, as far as its `Settings` has them: they are set there, for both.
 
     Raises
     ------

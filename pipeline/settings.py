@@ -44,19 +44,31 @@ def resolve(nodes: Sequence[Node], layers: Sequence[Layer]) -> dict[str, BaseMod
                 _known(str(field), list(models[stage].model_fields), f"setting of stage {stage}", origin)
             merged[stage] = _merge(merged[stage], values)
     settings = {name: _validated(name, models[name], merged[name], layers) for name in models}
-    return {node.name: settings[node.settings_of] for node in nodes}
+    return {node.name: _of(node, settings[node.settings_of]) for node in nodes}
 
 
 def _models(nodes: Sequence[Node]) -> dict[str, type[BaseModel]]:
-    """Models by the name they stand under."""
-    models: dict[str, type[BaseModel]] = {}
+    """Models of the stages that have settings of their own; the others find all their fields there."""
+    models = {node.name: node.settings for node in nodes if node.settings_of == node.name}
     for node in nodes:
-        if models.setdefault(node.settings_of, node.settings) is not node.settings:
+        owner = models.get(node.settings_of)
+        if owner is None:
+            raise UsageError(f"node {node.name} uses the settings of {node.settings_of}, which has none")
+        lacking = sorted(set(node.settings.model_fields) - set(owner.model_fields))
+        if lacking:
             raise UsageError(
-                f"node {node.name} shares the settings of {node.settings_of} but has another model",
-                next_step="both stages must have the same `Settings`",
+                f"node {node.name} needs {', '.join(lacking)}, which {node.settings_of} cannot be told"
             )
     return models
+
+
+def _of(node: Node, settings: BaseModel) -> BaseModel:
+    """What a stage sees of the settings it uses: the fields of its own model."""
+    if type(settings) is node.settings:
+        return settings
+    return node.settings.model_validate(
+        {name: getattr(settings, name) for name in node.settings.model_fields}
+    )
 
 
 def _known(name: str, known: Sequence[str], kind: str, origin: str) -> None:

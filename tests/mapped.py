@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -39,6 +39,20 @@ def map_small(folder: Path, cluster: str = "none", workers: int | None = None) -
     assert not errors
     store = Store(folder / "store")
     result = run(request, store, cluster=cluster, workers=workers)
+    assert not result.failures, [str(t.error) for t in result.failures]
+    return Mapped(result, store)
+
+
+def track_in_windows(
+    mapped: Mapped, folder: Path, cluster: str = "none", workers: int | None = None, *, windows: int = 3
+) -> Mapped:
+    """What was mapped, once more as far as odometry and in windows, in a copy of the store."""
+    settings = SMALL | {"odometry": {"windows": windows, "window_overlap_s": 1.0}}
+    request, errors = request_of(replace(order(folder, cluster), command_line=settings))
+    assert not errors
+    last = next(i for i, n in enumerate(request.nodes) if n.name == "odometry")
+    store = copy_store(mapped, folder)
+    result = run(replace(request, nodes=request.nodes[: last + 1]), store, cluster=cluster, workers=workers)
     assert not result.failures, [str(t.error) for t in result.failures]
     return Mapped(result, store)
 

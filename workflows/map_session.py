@@ -12,6 +12,7 @@ from scanloom.schemas.session import RawLog, Session, TruthLog
 from scanloom.schemas.tiles import MapFiles, Piece, Tile, TileFiles, TileIndex
 from scanloom.schemas.tracks import Gnss, Imu, Wheel
 from scanloom.schemas.trajectory import Odometry, Poses, Truth
+from scanloom.schemas.windows import Track, TrackEnds, Window
 from scanloom.stages.denoise import denoise
 from scanloom.stages.deskew import deskew
 from scanloom.stages.evaluation import evaluation
@@ -20,6 +21,8 @@ from scanloom.stages.ingest import ingest
 from scanloom.stages.loops.closing import loops
 from scanloom.stages.loops.places import places
 from scanloom.stages.odometry import odometry
+from scanloom.stages.odometry.tracking import track
+from scanloom.stages.odometry.windows import windows
 from scanloom.stages.report import report
 from scanloom.stages.sensors import sensors
 from scanloom.stages.simulate import simulate
@@ -34,10 +37,12 @@ NODES: tuple[Node, ...] = (
     node("simulate",   simulate,   per="session", reads=(),                                    writes=(RawLog, TruthLog), only=SIMULATED),
     node("truth",      truth,      per="session", reads=(TruthLog,),                           writes=Truth),
     node("ingest",     ingest,     per="session", reads=(RawLog,),                             writes=(Scans, Imu, Gnss, Wheel, Session)),
+    node("windows",    windows,    per="session", reads=(Scans,),                              writes=Window, settings="odometry"),
     node("sensors",    sensors,    per="session", reads=(Scans, Session, Imu, Wheel),          writes=SensorCheck),
     node("deskew",     deskew,     per="chunk",   reads=(Scans, Session, Imu, Wheel, SensorCheck), writes=Deskewed),
     node("denoise",    denoise,    per="chunk",   reads=(Deskewed, Session),                   writes=Labels),
-    node("odometry",   odometry,   per="session", reads=(Deskewed, Labels, Session, Imu, Wheel, SensorCheck), writes=Odometry),
+    node("track",      track,      per="window",  reads=(Window, Deskewed, Labels, Session, Imu, Wheel, SensorCheck), writes=(Track, TrackEnds), settings="odometry"),
+    node("odometry",   odometry,   per="session", reads=(Deskewed, Labels, Session, Imu, Wheel, SensorCheck, Track, TrackEnds), writes=Odometry),
     node("places",     places,     per="session", reads=(Deskewed, Labels, Odometry),          writes=Places),
     node("loops",      loops,      per="map",     reads=(Deskewed, Labels, Odometry, Places),  writes=Loops),
     node("fusion",     fusion,     per="map",     reads=(Session, Odometry, Loops, Gnss, Imu, SensorCheck), writes=(Poses, Graph)),

@@ -78,9 +78,15 @@ def _stage_page(n: Node) -> str:
     if n.stage.__doc__:
         parts += [inspect.cleandoc(n.stage.__doc__), "\n\n"]
     parts.append(f"Runs once per {n.per}. Reads {_names(n.reads) or 'nothing'}; writes {_names(n.writes)}.\n")
-    shared = f"\nThose of [{n.settings_of}]({n.settings_of}.md).\n"
-    parts += ["\n## Settings\n", _settings_table(n) if n.settings_of == n.name else shared]
+    parts += ["\n## Settings\n", _settings_section(n)]
     return "".join(parts)
+
+
+def _settings_section(n: Node) -> str:
+    owner = next(other for other in NODES if other.name == n.settings_of)
+    if n is not owner and n.settings is owner.settings:
+        return f"\nThose of [{owner.name}]({owner.name}.md).\n"
+    return _settings_table(n)
 
 
 def _settings_table(n: Node) -> str:
@@ -89,7 +95,7 @@ def _settings_table(n: Node) -> str:
         bounds = ", ".join(filter(None, (_bound(m) for m in field.metadata)))
         rows.append(
             (
-                f"`{n.name}.{name}`",
+                f"`{n.settings_of}.{name}`",
                 f"`{_shown(field.get_default(call_default_factory=True))}`",
                 bounds,
                 field.description or "",

@@ -11,10 +11,24 @@ from scanloom.stages.geometry.degeneracy import Indicator
 from scanloom.stages.geometry.se3 import F8
 
 
-class Settings(BaseModel):
-    """How scans are registered to the local map."""
+class Cutting(BaseModel):
+    """Whether a session is cut into windows."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    windows: int = Field(
+        0,
+        ge=0,
+        le=64,
+        description="stretches a long session is cut into, tracked side by side by as many workers; 0 or 1: not cut",
+    )
+    window_overlap_s: float = Field(
+        10.0, ge=1.0, le=300.0, description="how far a stretch reaches back into the one before it, s"
+    )
+
+
+class Settings(Cutting):
+    """How scans are registered to the local map."""
 
     voxel_size_m: float = Field(
         1.0, ge=0.1, le=5.0, description="edge of a voxel of the local map, also the reach of the search, m"
@@ -52,15 +66,6 @@ class Settings(BaseModel):
     keyframe_m: float = Field(1.0, ge=0.05, le=50.0, description="way between keyframes, m")
     keyframe_rad: float = Field(0.2, ge=0.01, le=3.0, description="turn between keyframes, rad")
     keyframe_s: float = Field(5.0, ge=0.1, le=1000.0, description="longest time between keyframes, s")
-    windows: int = Field(
-        0,
-        ge=0,
-        le=64,
-        description="stretches a long session is cut into, tracked at the same time, one thread each; 0 or 1: not cut",
-    )
-    window_overlap_s: float = Field(
-        10.0, ge=1.0, le=300.0, description="how far a stretch reaches back into the one before it, s"
-    )
     max_iterations: int = Field(20, ge=1, le=200, description="most searches for partners per scan")
     first_deviation_m: float = Field(
         0.5, ge=0.01, le=10.0, description="expected error of the first prediction, m"

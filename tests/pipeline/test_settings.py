@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import pytest
+from pydantic import create_model
 
 from scanloom.pipeline.fingerprint import digest
 from scanloom.pipeline.flow import Flow, Task
@@ -80,10 +81,20 @@ def test_shared_settings_are_set_where_they_stand():
         resolve(SHARING, [("command line", {"gentle": {"step": 4}})])
 
 
-def test_stages_that_share_settings_have_the_same_model():
+def test_a_stage_sees_only_what_its_own_model_has():
+    pace = create_model("Settings", pause_s=(float, 0.5))
+    hasty = dataclasses.replace(SHARING[-1], settings=pace)
+    settings = resolve((*NODES, hasty), [("command line", {"smooth": {"step": 4, "pause_s": 1}})])
+    assert settings["gentle"] == pace(pause_s=1)
+    assert resolve((*NODES, hasty), [])["gentle"] == pace(pause_s=0)
+
+
+def test_what_a_stage_uses_of_another_is_there():
     wrong = node("other", cut, per="chunk", reads=(Smooth, Shift), writes=Piece, settings="smooth")
-    with pytest.raises(UsageError, match="node other shares the settings of smooth but has another model"):
+    with pytest.raises(UsageError, match="node other needs width, which smooth cannot be told"):
         resolve((*NODES, wrong), [])
+    with pytest.raises(UsageError, match="node gentle uses the settings of smooth, which has none"):
+        resolve(SHARING[-1:], [])
 
 
 def test_shared_settings_are_part_of_the_key_and_named_in_the_reason(tmp_path, store):

@@ -13,6 +13,8 @@ from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.geometry.se3 import F8, inverse, se3_log
 from scanloom.stages.odometry import Settings, odometry
+from scanloom.stages.odometry.tracking import track
+from scanloom.stages.odometry.windows import windows
 from tests.worlds import GROUND_Z_M, BoxWorld, drive
 
 GYRO_BIAS_RAD_S = np.array([0.002, -0.001, 0.003])
@@ -29,10 +31,14 @@ class Drive:
     wheel: Wheel
 
     def run(self, settings: Settings | None = None, *, chunk: int = 10, sensors: bool = True) -> Odometry:
-        return odometry(
-            settings or Settings(), parts(self.scans, chunk), parts([labelled(s) for s in self.scans], chunk),
-            session(), self.imu if sensors else Imu.empty(), self.wheel if sensors else Wheel.empty(),
+        """As a map does: in windows where the settings say so."""
+        settings = settings or Settings()
+        inputs = (
+            parts(self.scans, chunk), parts([labelled(s) for s in self.scans], chunk), session(),
+            self.imu if sensors else Imu.empty(), self.wheel if sensors else Wheel.empty(),
         )  # fmt: skip
+        tracks = [track(settings, part.product, *inputs) for part in windows(settings, inputs[0])]
+        return odometry(settings, *inputs, None, [t for t, _ in tracks], [ends for _, ends in tracks])
 
 
 def drive_along(

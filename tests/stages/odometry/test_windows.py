@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from scanloom.schemas.product import columns_of
+from scanloom.schemas.product import Parts, columns_of
 from scanloom.schemas.scans import DeskewedScan
 from scanloom.schemas.trajectory import Odometry
+from scanloom.schemas.windows import Window
 from scanloom.stages.geometry.se3 import F8, inverse, se3_log
 from scanloom.stages.odometry import Settings
-from scanloom.stages.odometry.windows import Window, cut, scans_of
+from scanloom.stages.odometry.windows import cut, scans_of, windows
 from tests.stages.odometry.drives import Drive, drive_along, labelled, parts, step_errors
 from tests.worlds import street
 
@@ -22,36 +23,85 @@ CUT = Settings(windows=3, window_overlap_s=1.0)
 SEEDS = (2, 7)
 
 
+def window(first: int, own: int, last: int, **chunk: int) -> Window:
+    return Window(first=first, own=own, last=last, **chunk)
+
+
 def times(count: int) -> np.ndarray:
     return 10**18 + 100_000_000 * np.arange(count)
 
 
 def test_windows_reach_back_and_own_every_scan_once() -> None:
-    assert cut(times(90), 3, 1.0) == [Window(0, 0, 30), Window(20, 30, 60), Window(50, 60, 90)]
+    assert cut(times(90), 3, 1.0) == [window(0, 0, 30), window(20, 30, 60), window(50, 60, 90)]
 
 
 def test_a_session_too_short_for_its_overlaps_has_fewer_windows() -> None:
-    assert cut(times(90), 1, 1.0) == [Window(0, 0, 90)]
+    assert cut(times(90), 1, 1.0) == [window(0, 0, 90)]
     assert len(cut(times(81), 4, 1.0)) == 4
     assert len(cut(times(80), 4, 1.0)) == 3
-    assert cut(times(20), 4, 1.0) == [Window(0, 0, 20)]
+    assert cut(times(20), 4, 1.0) == [window(0, 0, 20)]
     assert len(cut(times(0), 4, 1.0)) == 1
 
 
 def test_a_window_reaches_back_over_a_pause_but_not_beyond_the_window_before() -> None:
     stamps = times(60)
     stamps[30:] += 10**10
-    assert cut(stamps, 2, 1.0) == [Window(0, 0, 30), Window(20, 30, 60)]
+    assert cut(stamps, 2, 1.0) == [window(0, 0, 30), window(20, 30, 60)]
     crowded = np.concatenate((times(10) - 10**12, times(50)[:40] // 10 + 9 * 10**17, times(50)[40:]))
     assert all(b.first >= a.own for a, b in itertools.pairwise(cut(crowded, 3, 300.0)))
 
 
-def test_scans_of_a_window_come_from_all_chunks_it_touches() -> None:
+class Times:
+    """A chunk of which only the index may be read."""
+
+    def __init__(self, stamps: np.ndarray) -> None:
+        self.index = [{"reference_ns": int(stamp)} for stamp in stamps]
+
+
+def test_the_windows_of_a_session_know_their_chunks() -> None:
+    stamps = times(90)
+    chunks = [(("chunk", f"{k:04d}"),) for k in range(5)]
+    scans = Parts(zip(chunks, (Times(stamps[i : i + 20]) for i in range(0, 90, 20)), strict=True))
+    found = list(windows(CUT, scans))
+    assert [part.key for part in found] == ["0000", "0001", "0002"]
+    assert [part.product for part in found] == [
+        window(0, 0, 30),
+        window(20, 30, 60, chunk=1, chunk_first=20),
+        window(50, 60, 90, chunk=2, chunk_first=40),
+    ]
+
+
+@pytest.mark.parametrize("settings", [Settings(), Settings(windows=1), Settings(windows=3)])
+def test_a_session_that_is_not_cut_has_no_windows(settings: Settings) -> None:
+    """Odometry then tracks it in one go. Nine seconds are too short for windows with ten seconds of overlap."""
+    assert list(windows(settings, Parts([((("chunk", "0000"),), Times(times(90)))]))) == []
+    assert list(windows(settings, Parts([]))) == []
+
+
+def test_scans_of_a_window_come_from_the_chunks_it_touches_and_no_other_is_opened() -> None:
     ride = drive_along(street(2), 12)
-    clouds, classes = parts(ride.scans, 5), parts([labelled(s) for s in ride.scans], 5)
-    for first, last in ((0, 12), (3, 7), (5, 10), (9, 12)):
-        found = [s.scan_index for s, _ in scans_of(clouds, classes, Window(first, first, last), "a")]
+    whole, labels = parts(ride.scans, 5), parts([labelled(s) for s in ride.scans], 5)
+    for first, last, touched in (
+        (0, 12, {0, 1, 2}),
+        (3, 7, {0, 1}),
+        (5, 10, {1}),
+        (9, 12, {1, 2}),
+        (10, 12, {2}),
+    ):
+        opened: set[int] = set()
+        clouds, classes = (_noting(p, opened) for p in (whole, labels))
+        piece = window(first, first, last, chunk=first // 5, chunk_first=first // 5 * 5)
+        found = [s.scan_index for s, _ in scans_of(clouds, classes, piece, "a")]
         assert found == list(range(first, last))
+        assert opened == touched
+
+
+def _noting(whole: Parts, opened: set[int]) -> Parts:
+    def load(k: int) -> object:
+        opened.add(k)
+        return whole[k]
+
+    return Parts([((("chunk", f"{k:04d}"),), k) for k in range(len(whole))], load=load)
 
 
 def test_bounds_of_the_settings() -> None:
@@ -124,7 +174,7 @@ def test_ends_agree(rides: list[Drive], whole: list[Odometry], joined: list[Odom
         assert 1e-6 < apart < 0.1
 
 
-def test_cut_runs_are_the_same_bytes_however_threads_take_turns(
+def test_cut_runs_are_the_same_bytes_however_the_log_is_chunked(
     rides: list[Drive], joined: list[Odometry]
 ) -> None:
     again = rides[0].run(CUT, chunk=7)
