@@ -48,8 +48,6 @@ class Tracker:
         self.T = np.eye(4)
         self.last_ns = 0
         self.rows = Rows()
-        self.kept: list[tuple[int, F8]] = []
-        """Thinned scans with their rows, for whoever joins this track to another."""
         self.bridged = 0
         self.deviation = RunningDeviation(settings.first_deviation_m)
         self.inlier_ratio = 0.0
