@@ -131,7 +131,7 @@ def _one(store: Store, key_or_prefix: str) -> Artifact:
         raise UsageError(
             f"no artifact has a key that starts with {key_or_prefix!r}",
             where=str(store.root),
-            next_step="`--dry-run` and `status` show keys",
+            next_step="`scanloom map LOG --dry-run` shows the keys of a map",
         )
     shown = ", ".join(f"{a.stage}/{a.key[:16]}" for a in found[:5])
     raise UsageError(f"{len(found)} artifacts have such a key: {shown}", next_step="give more of the key")

@@ -146,15 +146,13 @@ def map_command(
 
 def _show_plan(tasks: list[Any], errors: list[tuple[str, ScanloomError]], as_json: bool) -> None:
     if as_json:
-        rows = [
-            {"node": t.node, "coordinate": t.coordinate, "verdict": t.verdict, "reason": t.reason}
-            for t in tasks
-        ]
+        shown = ("node", "coordinate", "verdict", "reason", "key")
+        rows = [{name: getattr(task, name) for name in shown} for task in tasks]
         _emit({"tasks": rows, "failures": [str(error) for _, error in errors]})
     else:
         for task in tasks:
             place = "/".join(task.coordinate.values())
-            print(f"{task.verdict:5} {task.node:11} {place:24} {task.reason}")
+            print(f"{task.verdict:5} {task.node:11} {place:24} {task.key[:12]:12} {task.reason}")
         for _, error in errors:
             _say(f"scanloom: {error}")
     if errors and not tasks:
@@ -320,14 +318,16 @@ def gc(
         _emit(found)
     else:
         verb = "would free" if dry_run else "freed"
-        print(f"{verb} {found['bytes'] / 1e6:.1f} MB in {found['artifacts']} artifacts")
+        halves = f" and {found['leftovers']} leftovers" if found["leftovers"] else ""
+        print(f"{verb} {found['bytes'] / 1e6:.1f} MB in {found['artifacts']} artifacts{halves}")
 
 
 @app.command(hidden=True)
 def warm() -> None:
-    """Compile the numerical kernels once, so that the first map does not wait for it."""
-    from scanloom.workflows.warming import is_warm, warm_kernels
+    """Compile modules and numerical kernels once, so that the first map does not wait for it."""
+    from scanloom.workflows.warming import compile_modules, is_warm, warm_kernels
 
+    compile_modules()
     if is_warm():
         return
     _say("setup: compiling the numerical kernels (once per version of the code)")

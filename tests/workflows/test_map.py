@@ -91,6 +91,18 @@ def test_tile_size_reruns_tiling_and_what_follows(mapped: Path) -> None:
     assert {node for node, verdict in verdicts.items() if verdict != "HIT"} == after
 
 
+def test_a_dry_run_shows_keys_that_explain_knows(mapped: Path) -> None:
+    said = scanloom("map", "log", "--out", "out", "--dry-run", cwd=mapped)
+    (line,) = (line for line in said.stdout.splitlines() if line.split()[1] == "fusion")
+    verdict, _, key, *reason = line.split()
+    assert (verdict, reason) == ("HIT", ["already", "computed"])
+    done = scanloom("explain", key, cwd=mapped)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("fusion ") and key in done.stdout.splitlines()[0]
+    unknown = scanloom("explain", "zzz", cwd=mapped)
+    assert unknown.returncode == 2 and "--dry-run` shows the keys" in unknown.stderr
+
+
 @pytest.mark.parametrize(
     ("make", "said"),
     [
