@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import importlib
 import os
+import sys
 import threading
 import time
+from collections.abc import Iterator
 
 import scanloom.workflows.map_session  # noqa: F401  (all stages, and with them all kernels)
 from scanloom.pipeline.task import at_work
@@ -18,6 +20,20 @@ from scanloom.stages.geometry.kernels import load_kernels
 LATER = ("scipy.special", "gtsam", "scipy.spatial", "scipy.ndimage", "pyproj")
 """What fusion, evaluation and report import inside their functions, in the order they are used."""
 PAUSE_S = 0.02
+
+
+def _first_kernel(kernels: Iterator[None]) -> None:
+    """Sets numba up. It would import scipy.linalg only to see whether BLAS is there, for a fifth of a second on which every
+    run waits; no kernel multiplies matrices with it."""
+    if "scipy.linalg" in sys.modules:
+        next(kernels, None)
+        return
+    sys.modules["scipy.linalg"] = None  # type: ignore[assignment]  # importing it fails until this is undone
+    try:
+        importlib.import_module("numba.np.arraymath")
+    finally:
+        del sys.modules["scipy.linalg"]
+    next(kernels, None)
 
 
 _kernels = load_kernels()
@@ -41,5 +57,5 @@ def _on_the_side() -> None:
     threading.Thread(target=load_while_idle, name="loading", daemon=True).start()
 
 
-next(_kernels, None)
+_first_kernel(_kernels)
 os.register_at_fork(after_in_child=_on_the_side)

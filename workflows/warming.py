@@ -1,8 +1,10 @@
-"""Compile the numerical kernels ahead of the first map, by mapping a few simulated seconds."""
+"""Compile ahead of the first map: the modules to bytecode, and the kernels by mapping a few simulated seconds."""
 
 from __future__ import annotations
 
+import compileall
 import tempfile
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
 
@@ -16,12 +18,21 @@ from scanloom.workflows.build_map import Order, build_map
 from scanloom.workflows.sessions import SAMPLE
 
 MARKER = "warm"
+PACKAGES = ("schemas", "stages", "pipeline", "workflows")
 BARE_SCANS = 12
 
 
 def is_warm() -> bool:
     """Whether this version of the code was compiled on this machine."""
     return (cache_folder() / MARKER).exists()
+
+
+def compile_modules() -> None:
+    """Bytecode of every module, also where Python is told not to write it (containers often are): else each process of
+    each run would compile them all. Where the package is read-only nothing happens."""
+    for name in PACKAGES:
+        for folder in import_module(f"scanloom.{name}").__path__:
+            compileall.compile_dir(folder, quiet=2)
 
 
 def warm_kernels() -> None:

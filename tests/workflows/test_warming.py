@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 
 from scanloom.stages.geometry import kernels
 from scanloom.stages.geometry.voxels import downsample
+from scanloom.workflows import warming
 
 
 def run_python(code: str) -> str:
@@ -53,3 +55,24 @@ task._under_way.clear(); side.join(5)
 print(busy, "colorsys" in sys.modules)
 """
     assert run_python(code) == "(False, 1) True"
+
+
+def test_workers_start_without_scipy_and_can_import_it():
+    code = """
+import sys
+import scanloom.workflows.warm_workers
+before = "scipy.linalg" in sys.modules
+import scipy.linalg
+print(before, scipy.linalg.norm([3.0, 4.0]))
+"""
+    assert run_python(code) == "False 5.0"
+
+
+def test_modules_are_compiled_also_where_python_is_told_not_to(tmp_path, monkeypatch):
+    (tmp_path / "thing.py").write_text("A = 1\n")
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    monkeypatch.setattr(warming, "import_module", lambda name: SimpleNamespace(__path__=[str(tmp_path)]))
+    warming.compile_modules()
+    assert len(list(tmp_path.glob("__pycache__/thing.*.pyc"))) == 1
+    (tmp_path / "thing.py").write_text("A = (\n")
+    warming.compile_modules()  # what does not compile says so when it is imported
