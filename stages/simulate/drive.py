@@ -34,7 +34,7 @@ class Drive:
 
     def write_log(self, stream: IO[bytes]) -> None:
         s = self.settings
-        town = build_town(s.town_seed, s.parking_seed)
+        town = build_town(s.town_seed, s.parking_seed, s.tunnel_m)
         path = build_path(ring(), town.terrain) if s.route == "roundabout" else town.path
         town.path = path
         motion = build_motion(s, path)

@@ -14,13 +14,13 @@ from scanloom.stages.simulate.settings import Settings
 from scanloom.stages.simulate.terrain import (
     BRIDGE_X,
     EAST_X,
-    FIELD_X,
     LANE_M,
     NORTH_Y,
     OPENING,
     PLATEAU_Y,
     ROUNDABOUT,
     ROUNDABOUT_R,
+    Plan,
     Terrain,
     deck_height,
 )
@@ -65,7 +65,7 @@ class Path:
         return float(s[np.argmin(np.hypot(p[:, 0] - x, p[:, 1] - y))])
 
 
-def town_lap() -> F8:
+def town_lap(plan: Plan) -> F8:
     """Corners of the lap (n, 3): x, y and the radius of the turn, m. Traffic keeps to the right.
 
     Once round the block anticlockwise, South Street a second time, through the tunnel to the field, back over the
@@ -76,7 +76,7 @@ def town_lap() -> F8:
     circle = np.column_stack((cx + r * np.cos(angles), r * np.sin(angles), np.zeros(len(angles))))
     corners = [
         [EAST_X + lane, -lane, 9], [EAST_X + lane, NORTH_Y + lane, 9], [-lane, NORTH_Y + lane, 9], [-lane, -lane, 9],
-        [FIELD_X + lane, -lane, 31], [FIELD_X + lane, PLATEAU_Y + lane, 31], [BRIDGE_X - lane, PLATEAU_Y + lane, 10],
+        [plan.field_x + lane, -lane, 31], [plan.field_x + lane, PLATEAU_Y + lane, 31], [BRIDGE_X - lane, PLATEAU_Y + lane, 10],
         [BRIDGE_X - lane, lane, 7], [-60, lane, 0],
     ]  # fmt: skip
     return np.vstack(([[-50.0, -lane, 0.0]], corners, circle, [[-60.0, -lane, 0.0]]))

@@ -6,6 +6,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from scanloom.stages.simulate.terrain import TUNNEL_M
+
 SMALL = {"duration_s": 8.0, "beams": 16, "columns": 512, "standstill_s": 1.0}
 """What `size: small` changes unless it is set by hand: a log of seconds for tests."""
 
@@ -30,6 +32,12 @@ class Settings(BaseModel):
         "town", description="town: the whole lap, again and again; roundabout: circles of 54 m, a tiny loop"
     )
     start_m: float = Field(0.0, ge=0.0, le=5000.0, description="place on the route where the drive starts, m")
+    tunnel_m: float = Field(
+        TUNNEL_M,
+        ge=40.0,
+        le=2000.0,
+        description="length of the tunnel, m; what lies beyond it moves; one over 100 m has signs, and emergency stations in niches",
+    )
     standstill_s: float = Field(2.5, ge=0.0, le=60.0, description="time at rest before the drive, s")
     top_speed_m_s: float = Field(13.0, ge=1.0, le=30.0, description="speed limit outside the town, m/s")
     traffic: bool = Field(True, description="cars, a truck, a cyclist and pedestrians move about")

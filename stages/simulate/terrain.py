@@ -1,7 +1,8 @@
 """The ground: height, roads, what it is made of.
 
 Coordinates are metres east, north and up of the town's origin. South Street runs along y = 0 into the tunnel and on to
-the field; the bridge carries a street along x = BRIDGE_X over North Street (y = NORTH_Y).
+the field; the bridge carries a street along x = BRIDGE_X over North Street (y = NORTH_Y). A longer tunnel moves what lies
+east of it.
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.simulate.meshes import Material, Mesh, grid_mesh
 
-WEST, EAST, SOUTH, NORTH = -185.0, 350.0, -110.0, 255.0
+WEST, SOUTH, NORTH = -185.0, -110.0, 255.0
 CELL_M = 1.25
 RASTER_M = 0.25
-BRIDGE_X, NORTH_Y, PLATEAU_Y, FIELD_X, EAST_X = 45.0, 90.0, 150.0, 245.0, 90.0
+BRIDGE_X, NORTH_Y, PLATEAU_Y, EAST_X = 45.0, 90.0, 150.0, 90.0
 OPENING = (82.0, 98.0)
-TUNNEL = (125.0, 197.0)
+TUNNEL_X, TUNNEL_M = 125.0, 72.0
 RISE_M, DIP_M = 4.2, 2.0
 ROUNDABOUT = (-75.0, 0.0)
 ROUNDABOUT_R = 9.0
@@ -57,20 +58,46 @@ class Road:
         return np.where(inside, off, np.inf)
 
 
-ROADS = (
-    Road((-66, 0), (118, 0)),
-    Road((118, 0), (215, 0), town=False),
-    Road((215, 0), (245, 30), town=False, centre=(215, 30)),
-    Road((245, 30), (245, 120), town=False),
-    Road((245, 120), (215, 150), town=False, centre=(215, 120)),
-    Road((215, 150), (-20, 150), town=False),
-    Road((45, 150), (45, OPENING[1]), town=False),
-    Road((45, OPENING[0]), (45, 0), town=False),
-    Road((90, 0), (90, 90)),
-    Road((115, 90), (-20, 90)),
-    Road((0, 0), (0, 90)),
-    Road((-66, 0), (-66, 0), town=False, centre=ROUNDABOUT),
-)
+@dataclass(frozen=True)
+class Plan:
+    """Where the tunnel ends and what lies beyond it: x in metres, for a tunnel of a given length."""
+
+    tunnel_m: float = TUNNEL_M
+
+    @property
+    def beyond_m(self) -> float:
+        """How far everything beyond the tunnel is moved, m."""
+        return self.tunnel_m - TUNNEL_M
+
+    @property
+    def tunnel(self) -> tuple[float, float]:
+        return TUNNEL_X, TUNNEL_X + self.tunnel_m
+
+    @property
+    def field_x(self) -> float:
+        return 245.0 + self.beyond_m
+
+    @property
+    def east(self) -> float:
+        return 350.0 + self.beyond_m
+
+    def roads(self) -> tuple[Road, ...]:
+        """All roads of the town and round the field."""
+        x, curve = self.field_x, 215.0 + self.beyond_m
+        return (
+            Road((-66, 0), (118, 0)),
+            Road((118, 0), (curve, 0), town=False),
+            Road((curve, 0), (x, 30), town=False, centre=(curve, 30)),
+            Road((x, 30), (x, 120), town=False),
+            Road((x, 120), (curve, 150), town=False, centre=(curve, 120)),
+            Road((curve, 150), (-20, 150), town=False),
+            Road((45, 150), (45, OPENING[1]), town=False),
+            Road((45, OPENING[0]), (45, 0), town=False),
+            Road((90, 0), (90, 90)),
+            Road((115, 90), (-20, 90)),
+            Road((0, 0), (0, 90)),
+            Road((-66, 0), (-66, 0), town=False, centre=ROUNDABOUT),
+        )
 
 
 def smoothstep(u: ArrayLike) -> F8:
@@ -80,10 +107,10 @@ def smoothstep(u: ArrayLike) -> F8:
     return out
 
 
-def road_distance(x: F8, y: F8) -> tuple[F8, NDArray[np.bool_]]:
+def road_distance(plan: Plan, x: F8, y: F8) -> tuple[F8, NDArray[np.bool_]]:
     """Distance to the nearest centre line, m, and whether that road is one of the town."""
     best, town = np.full(np.shape(x), np.inf), np.zeros(np.shape(x), bool)
-    for road in ROADS:
+    for road in plan.roads():
         d = road.distance(x, y)
         nearer = d < best
         best, town = np.where(nearer, d, best), np.where(nearer, road.town, town)
@@ -100,7 +127,7 @@ def embankment(x: F8) -> F8:
     return 1 - smoothstep((np.abs(x - BRIDGE_X) - 5.5) / 5.0)
 
 
-def height(x: ArrayLike, y: ArrayLike) -> F8:
+def height(plan: Plan, x: ArrayLike, y: ArrayLike) -> F8:
     """Height of the ground, m: relief, plateau in the north, ramps, underpass, road camber and kerbs."""
     x, y = np.asarray(x, float), np.asarray(y, float)
     gentle = 60 * smoothstep((x - 112) / 70)
@@ -109,7 +136,9 @@ def height(x: ArrayLike, y: ArrayLike) -> F8:
     ramp = np.where(south, RISE_M * smoothstep((y - 8) / 68), np.where(north, RISE_M, 0.0))
     on_ramp = embankment(x) * (south | north) * (y > 0)
     dip = DIP_M * np.exp(-(((x - BRIDGE_X) / 18) ** 2)) * (1 - smoothstep((np.abs(y - NORTH_Y) - 5) / 5))
-    return relief(x, y) + plateau + on_ramp * (ramp - plateau) - dip * (1 - on_ramp) + _road_profile(x, y)
+    return (
+        relief(x, y) + plateau + on_ramp * (ramp - plateau) - dip * (1 - on_ramp) + _road_profile(plan, x, y)
+    )
 
 
 def deck_height(x: ArrayLike, y: ArrayLike) -> F8:
@@ -118,9 +147,9 @@ def deck_height(x: ArrayLike, y: ArrayLike) -> F8:
     return relief(x, y) + RISE_M - 0.02 * np.minimum(np.abs(x - BRIDGE_X), 3.5)
 
 
-def _road_profile(x: F8, y: F8) -> F8:
+def _road_profile(plan: Plan, x: F8, y: F8) -> F8:
     """Camber of 2 % on the lanes, sidewalks 0.1 m above the road in town, verges 0.1 m below elsewhere."""
-    d, town = road_distance(x, y)
+    d, town = road_distance(plan, x, y)
     camber = -0.02 * np.minimum(d, 3.5)
     kerb = np.where(town, 0.1 * smoothstep((d - 5.5) / 0.6), -0.1 * smoothstep((d - 4.2) / 1.5))
     return camber + kerb
@@ -134,6 +163,7 @@ class Terrain:
     """(rows, columns) height at the grid's corners, m; row 0 is the south."""
     material: NDArray[np.uint8]
     """(rows, columns) `Material` of each raster cell."""
+    plan: Plan
 
     def height(self, x: F8, y: F8) -> F8:
         """Height of the ground as it was built, m: bilinear between the corners."""
@@ -153,18 +183,20 @@ class Terrain:
         return grid_mesh(x, y, self.z.astype(float), Material.GRASS)
 
 
-def build_terrain(rng: np.random.Generator) -> Terrain:
+def build_terrain(rng: np.random.Generator, plan: Plan) -> Terrain:
     """The ground with rough grass; roads stay smooth."""
-    x, y = np.meshgrid(np.arange(WEST, EAST + 0.1, CELL_M), np.arange(SOUTH, NORTH + 0.1, CELL_M))
-    d, _ = road_distance(x, y)
+    x, y = np.meshgrid(np.arange(WEST, plan.east + 0.1, CELL_M), np.arange(SOUTH, NORTH + 0.1, CELL_M))
+    d, _ = road_distance(plan, x, y)
     rough = 0.006 + 0.04 * smoothstep((d - 6) / 4)
-    z = height(x, y) + rough * rng.standard_normal(x.shape)
-    return Terrain(z.astype(np.float32), _materials())
+    z = height(plan, x, y) + rough * rng.standard_normal(x.shape)
+    return Terrain(z.astype(np.float32), _materials(plan), plan)
 
 
-def _materials() -> NDArray[np.uint8]:
-    x, y = np.meshgrid(np.arange(WEST, EAST, RASTER_M) + 0.125, np.arange(SOUTH, NORTH, RASTER_M) + 0.125)
-    d, town = road_distance(x, y)
+def _materials(plan: Plan) -> NDArray[np.uint8]:
+    x, y = np.meshgrid(
+        np.arange(WEST, plan.east, RASTER_M) + 0.125, np.arange(SOUTH, NORTH, RASTER_M) + 0.125
+    )
+    d, town = road_distance(plan, x, y)
     out = np.full(x.shape, Material.GRASS, np.uint8)
     out[town & (d < 8.2)] = Material.PAVING
     out[d < np.where(town, 5.7, 3.9)] = Material.ASPHALT

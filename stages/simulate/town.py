@@ -13,18 +13,21 @@ from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.simulate import meshes
 from scanloom.stages.simulate.meshes import Material, Mesh
 from scanloom.stages.simulate.route import Path, build_path, town_lap
-from scanloom.stages.simulate.structures import bridge, tunnel
+from scanloom.stages.simulate.structures import bridge
 from scanloom.stages.simulate.terrain import (
     BRIDGE_X,
     EAST_X,
     NORTH_Y,
     ROUNDABOUT,
-    TUNNEL,
+    TUNNEL_M,
+    TUNNEL_X,
+    Plan,
     Terrain,
     build_terrain,
     embankment,
     road_distance,
 )
+from scanloom.stages.simulate.tunnel import tunnel
 
 
 @dataclass(frozen=True)
@@ -80,16 +83,17 @@ class Town:
         )
 
 
-def build_town(town_seed: int, parking_seed: int) -> Town:
+def build_town(town_seed: int, parking_seed: int, tunnel_m: float = TUNNEL_M) -> Town:
     """Terrain, structures, houses, greenery, street furniture, parked cars."""
+    plan = Plan(tunnel_m)
     rng = np.random.default_rng((town_seed, 1))
-    terrain = build_terrain(rng)
-    town = Town(terrain, build_path(town_lap(), terrain))
+    terrain = build_terrain(rng, plan)
+    town = Town(terrain, build_path(town_lap(plan), terrain))
     town.add(terrain.mesh(), PointClass.GROUND)
-    for mesh, kind in (*bridge(), *tunnel()):
+    for mesh, kind in (*bridge(), *tunnel(plan)):
         town.add(mesh, kind)
     plots = _houses(town, rng)
-    free = _Free(town.path, plots)
+    free = _Free(plan, town.path, plots)
     _furniture(town, rng, free)
     _greenery(town, rng, free)
     _parked_cars(town, np.random.default_rng((town_seed, 2, parking_seed)))
@@ -99,12 +103,16 @@ def build_town(town_seed: int, parking_seed: int) -> Town:
 class _Free:
     """Where something may stand: off the driven path, off the houses."""
 
-    def __init__(self, path: Path, plots: list[F8]) -> None:
+    def __init__(self, plan: Plan, path: Path, plots: list[F8]) -> None:
+        self._plan = plan
         self._path = cKDTree(path.at(np.arange(0, path.length_m, 0.5))[:, :2])
         self._plots = plots
 
     def __call__(self, x: float, y: float, *, path_m: float = 2.6, road_m: float = 4.0) -> bool:
-        if self._path.query((x, y))[0] < path_m or road_distance(np.array(x), np.array(y))[0] < road_m:
+        if (
+            self._path.query((x, y))[0] < path_m
+            or road_distance(self._plan, np.array(x), np.array(y))[0] < road_m
+        ):
             return False
         return not any(_inside(plot, x, y) for plot in self._plots)
 
@@ -127,7 +135,7 @@ def _houses(town: Town, rng: np.random.Generator) -> list[F8]:
                 corners = np.array([front - along * width / 2, front + along * width / 2 + across * depth])
                 plot = np.sort(corners, axis=0)
                 mesh = meshes.house(rng, width, depth, rng.uniform(*street.tall_m))
-                if _buildable(plot, plots):
+                if _buildable(town.terrain.plan, plot, plots):
                     yaw = np.arctan2(across[1], across[0]) - np.pi / 2
                     town.put(mesh, float(front[0]), float(front[1]), float(yaw), instance=True)
                     plots.append(plot)
@@ -135,11 +143,11 @@ def _houses(town: Town, rng: np.random.Generator) -> list[F8]:
     return plots
 
 
-def _buildable(plot: F8, plots: list[F8]) -> bool:
+def _buildable(plan: Plan, plot: F8, plots: list[F8]) -> bool:
     x, y = np.meshgrid(*(np.linspace(low, high, 5) for low, high in plot.T))
-    if road_distance(x, y)[0].min() < 8.3 or ((embankment(x) > 0.02) & (y > 5) & (y < 160)).any():
+    if road_distance(plan, x, y)[0].min() < 8.3 or ((embankment(x) > 0.02) & (y > 5) & (y < 160)).any():
         return False
-    if (plot[1, 0] > TUNNEL[0] - 4 and plot[0, 1] < 40) or np.hypot(x - ROUNDABOUT[0], y).min() < 18:
+    if (plot[1, 0] > TUNNEL_X - 4 and plot[0, 1] < 40) or np.hypot(x - ROUNDABOUT[0], y).min() < 18:
         return False
     return not any((plot[0] < other[1] + 0.4).all() and (other[0] < plot[1] + 0.4).all() for other in plots)
 
@@ -175,6 +183,7 @@ def _furniture(town: Town, rng: np.random.Generator, free: _Free) -> None:
 
 def _greenery(town: Town, rng: np.random.Generator, free: _Free) -> None:
     """Trees along the streets and in gardens, bushes, an island with a tree, and little on the field."""
+    beyond = town.terrain.plan.beyond_m
     kinds = [meshes.tree(rng) for _ in range(12)]
     shrubs = [meshes.bush(rng) for _ in range(8)]
     for street in STREETS[:3]:
@@ -193,13 +202,13 @@ def _greenery(town: Town, rng: np.random.Generator, free: _Free) -> None:
             town.put(shape, x, y, turn)
     town.put(kinds[0], *ROUNDABOUT)
     for _ in range(10):
-        x, y = rng.uniform(205, 330), rng.uniform(10, 190)
+        x, y = rng.uniform(205 + beyond, 330 + beyond), rng.uniform(10, 190)
         if free(x, y, road_m=9):
             town.put(shrubs[rng.integers(8)], x, y)
-    town.put(kinds[1], 262.0, 88.0)
+    town.put(kinds[1], 262.0 + beyond, 88.0)
     post = meshes.cylinder([0, 0, -0.3], [0, 0, 1.0], 0.06, Material.RETRO, 6)
     for y in np.arange(35, 120, 25.0):
-        town.put(post, 240.2, float(y))
+        town.put(post, 240.2 + beyond, float(y))
 
 
 def _parked_cars(town: Town, rng: np.random.Generator) -> None:

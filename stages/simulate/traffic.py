@@ -12,7 +12,7 @@ from scanloom.stages.simulate.meshes import Material, Mesh, car, cyclist, person
 from scanloom.stages.simulate.motion import Motion
 from scanloom.stages.simulate.route import Path
 from scanloom.stages.simulate.settings import Settings
-from scanloom.stages.simulate.terrain import FIELD_X, LANE_M
+from scanloom.stages.simulate.terrain import LANE_M, Plan
 
 ONCOMING_M = 2 * LANE_M
 """Offset of the other lane to the left, m."""
@@ -21,8 +21,8 @@ CLEARANCE_M = 2.1
 LEAD_S = 4.0
 """The truck drives this far ahead, s."""
 DUST_AGES_S = np.arange(0.35, 3.0, 0.4)
-DUST_FROM_X = FIELD_X - 45.0
-"""East of this the road is dry earth."""
+DUSTY_M = 45.0
+"""From this far before the field the road is dry earth."""
 
 
 @dataclass(frozen=True)
@@ -112,9 +112,10 @@ def dust(settings: Settings, path: Path, actors: list[Actor], t: float) -> list[
     if not actors or settings.dust_per_m == 0:
         return []
     poses = actors[0].poses(path, t - DUST_AGES_S)
+    dusty_x = Plan(settings.tunnel_m).field_x - DUSTY_M
     puffs = []
     for age, T in zip(DUST_AGES_S, poses):
-        if T[0, 3] < DUST_FROM_X:
+        if T[0, 3] < dusty_x:
             continue
         centre = T[:3, 3] + np.array([0.3 * age, 0.8 * age, 0.5 + 0.25 * age])
         puffs.append(Puff(centre, 1.0 + 0.7 * age, settings.dust_per_m * float(np.exp(-age / 1.5))))

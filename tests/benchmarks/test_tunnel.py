@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks.systems import Outcome
-from benchmarks.tunnel import PORTAL_M, axis_flagged, error_percent, stretch
+from benchmarks.tunnel import PORTAL_M, TUNNEL, axis_flagged, error_percent, stretch
 from scanloom.schemas.trajectory import Truth
 from scanloom.stages.geometry.se3 import pose, so3_exp
-from scanloom.stages.simulate.terrain import TUNNEL
 
 FORWARD = np.array([1.0, 0.0, 0.0])
 LEAST_P = 0.9
@@ -48,7 +47,7 @@ def test_axis_is_flagged(outcome: Outcome, flagged: bool) -> None:
 
 
 def drive() -> np.ndarray:
-    x = np.arange(60.0, 261.0, 1.0)
+    x = np.arange(TUNNEL[0] - 65.0, TUNNEL[1] + 65.0, 1.0)
     return pose(np.eye(3), np.column_stack((x, 0 * x - 1.7, 0 * x)))
 
 
