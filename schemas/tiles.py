@@ -16,14 +16,17 @@ class Piece(Table):
     """What one chunk adds to one tile: sums per voxel, to be merged. One part per tile, keyed `X_Y`."""
 
     NAME: ClassVar[str] = "piece"
+    SCHEMA_VERSION: ClassVar[int] = 2
     ON_THE_WAY: ClassVar[bool] = True
     SPLIT_BY: ClassVar[str] = "tile"
 
-    voxel: NDArray[np.int32] = column("i4", "voxel index from the tile's corner", shape=(3,))
-    count: NDArray[np.int32] = column("i4", "points summed")
-    sum_m: NDArray[np.float64] = column(
-        "f8", "sum of coordinates from the tile's corner", unit="m", shape=(3,)
+    voxel: NDArray[np.int64] = column(
+        "i8", "voxel from the tile's corner, x 2^29 + y 2^19 + z + 2^18; rows are ordered by it"
     )
+    count: NDArray[np.int32] = column("i4", "points summed")
+    sum_x_m: NDArray[np.float64] = column("f8", "sum of x from the tile's corner", unit="m")
+    sum_y_m: NDArray[np.float64] = column("f8", "sum of y from the tile's corner", unit="m")
+    sum_z_m: NDArray[np.float64] = column("f8", "sum of z", unit="m")
     sum_intensity: NDArray[np.float64] = column("f8", "sum of intensities")
     ground_count: NDArray[np.int32] = column("i4", "points of class ground among them")
     scan_count: NDArray[np.int32] = column("i4", "scans that hit the voxel")

@@ -93,7 +93,9 @@ def _piece(settings: Settings, tile: TileSums, poses: Poses) -> Piece:
     return Piece(
         voxel=tile.voxel,
         count=tile.count,
-        sum_m=tile.sum_m,
+        sum_x_m=tile.sum_x_m,
+        sum_y_m=tile.sum_y_m,
+        sum_z_m=tile.sum_z_m,
         sum_intensity=tile.sum_intensity,
         ground_count=tile.ground_count,
         scan_count=tile.scan_count,

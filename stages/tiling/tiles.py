@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from scanloom.schemas.errors import StageError
-from scanloom.schemas.product import Parts
+from scanloom.schemas.product import Parts, columns_of
 from scanloom.schemas.scans import PointClass
 from scanloom.schemas.tiles import Piece, Tile, TileFiles
 from scanloom.stages.tiling import ply
@@ -70,11 +71,10 @@ def merge_all(name: str, pieces: Iterable[Piece]) -> Piece:
 
 
 def merge(pieces: list[Piece]) -> Piece:
-    """Add up pieces of one tile voxel by voxel; voxels come out ordered by (x, y, z) index."""
+    """Add up pieces of one tile voxel by voxel; rows come out ordered by voxel."""
     voxel = np.concatenate([piece.voxel for piece in pieces])
-    keys = _keys(voxel)
-    order = np.argsort(keys, kind="stable")  # timsort: the pieces come sorted, so this is a merge
-    starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    order = np.argsort(voxel, kind="stable")  # timsort: the pieces come sorted, so this is a merge
+    starts = np.flatnonzero(np.diff(voxel[order], prepend=-1))
     if len(pieces) == 1 and len(starts) == len(order):
         return pieces[0].take(order)
 
@@ -82,28 +82,14 @@ def merge(pieces: list[Piece]) -> Piece:
         """One column at a time: a dense tile is large."""
         return _sum_runs(np.concatenate([getattr(piece, column) for piece in pieces]), order, starts)
 
-    return Piece(
-        voxel=voxel[order[starts]],
-        count=total("count"),
-        sum_m=total("sum_m"),
-        sum_intensity=total("sum_intensity"),
-        ground_count=total("ground_count"),
-        scan_count=total("scan_count"),
-        **pieces[0].attributes,
-    )
-
-
-def _keys(voxel: NDArray[np.int32]) -> NDArray[np.int64]:
-    """One number per voxel that orders as (x, y, z); x and y are below 1024, z within 2^30 of zero."""
-    x, y, z = voxel.astype(np.int64).T
-    keys: NDArray[np.int64] = (x << 42) | (y << 32) | (z + (1 << 30))
-    return keys
+    sums: dict[str, Any] = {name: total(name) for name in columns_of(Piece) if name != "voxel"}
+    return Piece(voxel=voxel[order[starts]], **sums, **pieces[0].attributes)
 
 
 def _sum_runs(values: NDArray, order: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray:
     if len(starts) == 0:
         return values[order]
-    return np.add.reduceat(values[order], starts, axis=0).astype(values.dtype)
+    return np.add.reduceat(values[order], starts).astype(values.dtype)
 
 
 def _identity(pieces: Parts[Piece]) -> tuple[str, tuple[str, ...]]:
@@ -121,12 +107,11 @@ def _identity(pieces: Parts[Piece]) -> tuple[str, tuple[str, ...]]:
 def _average(sums: Piece, name: str, sessions: tuple[str, ...]) -> Tile:
     x, y = tile_position(name)
     count = np.maximum(sums.count, 1)
-    mean = (sums.sum_m / count[:, None]).astype(np.float32)
     ground = 2 * sums.ground_count > sums.count
     return Tile(
-        x_m=np.ascontiguousarray(mean[:, 0]),
-        y_m=np.ascontiguousarray(mean[:, 1]),
-        z_m=np.ascontiguousarray(mean[:, 2]),
+        x_m=(sums.sum_x_m / count).astype(np.float32),
+        y_m=(sums.sum_y_m / count).astype(np.float32),
+        z_m=(sums.sum_z_m / count).astype(np.float32),
         intensity=(sums.sum_intensity / count).astype(np.float32),
         class_=np.where(ground, PointClass.GROUND, PointClass.STATIC).astype(np.uint8),
         count=sums.count,

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scanloom.schemas.errors import StageError
 from scanloom.stages.geometry.kernels import kernel
 
+F8 = NDArray[np.float64]
 Int = int | np.integer[Any]
 """A whole number inside a kernel, where numpy scalars pass for Python's."""
 
@@ -41,12 +42,21 @@ class TileSums:
     """Voxels of one tile, ordered by (x, y, z) index. See `schemas.tiles.Piece` for the columns."""
 
     tile: tuple[int, int]
-    voxel: NDArray[np.int32]
+    voxel: NDArray[np.int64]
     count: NDArray[np.int32]
-    sum_m: NDArray[np.float64]
+    sum_x_m: NDArray[np.float64]
+    sum_y_m: NDArray[np.float64]
+    sum_z_m: NDArray[np.float64]
     sum_intensity: NDArray[np.float64]
     ground_count: NDArray[np.int32]
     scan_count: NDArray[np.int32]
+
+
+def voxel_indices(voxel: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Indices (n, 3) along x, y, z from the tile's corner of the packed voxels (n,) of a piece."""
+    side = (1 << _SIDE_BITS) - 1
+    z = (voxel & ((1 << _HEIGHT_BITS) - 1)) - _HEIGHT_HALF
+    return np.column_stack(((voxel >> (_SIDE_BITS + _HEIGHT_BITS)) & side, (voxel >> _HEIGHT_BITS) & side, z))
 
 
 class VoxelSums:
@@ -63,6 +73,7 @@ class VoxelSums:
         self._used = 0
         self._keys, self._records = np.empty(0, np.int64), np.empty((0, 8))
         self._scans = 0
+        self._runs = _Runs(0)
         self._rehash(FIRST_SLOTS)
 
     def __len__(self) -> int:
@@ -88,36 +99,30 @@ class VoxelSums:
         n = len(points[0])
         self._scans += 1
         self._grow_for(n)
-        keys, steps, rows = np.empty(n, np.int64), np.empty((n, 5), np.float32), np.empty(n, np.int32)
-        kept = _quantise(
-            *points,
-            intensity,
-            classes,
-            keep,
-            ground_class,
-            T,
-            self._voxel_m,
-            self._tile_m,
-            self._side,
-            keys,
-            steps,
-        )
-        if kept < 0:
+        if len(self._runs.keys) < n:
+            self._runs = _Runs(n + n // 8)
+        runs = self._runs
+        found = _runs(
+            *points, intensity, classes, keep, ground_class, T, self._voxel_m, self._tile_m, self._side, runs.keys,
+            runs.sums,
+        )  # fmt: skip
+        if found < 0:
             raise StageError(
                 f"a point lies more than {_TILE_HALF * self._tile_m / 1000:.0f} km from the origin of the map",
                 next_step="look at the poses of this session: they have most likely diverged",
             )
-        self._used = _find(keys[:kept], rows, self._table, self._keys, self._used)
-        _add(rows[:kept], steps, self._records, self._scans)
+        self._used = _find(runs.keys[:found], runs.rows, self._table, self._keys, self._used)
+        _add(runs.rows[:found], runs.sums, self._records, self._scans)
 
     def tiles(self) -> list[TileSums]:
         """All voxels, tile by tile, ordered by tile and voxel."""
         keys = self._keys[: self._used]
         order = np.argsort(keys)
         keys = keys[order]
+        columns: tuple[Any, ...] = (keys & ((1 << _TILE_SHIFT) - 1), *_columns(order, self._records))
         starts = np.flatnonzero(np.diff(keys >> _TILE_SHIFT, prepend=_EMPTY))
         ends = np.append(starts[1:], len(keys))
-        return [_tile_sums(keys[a:b], self._records[order[a:b]]) for a, b in zip(starts, ends)]
+        return [TileSums(_tile(keys[a]), *(c[a:b] for c in columns)) for a, b in zip(starts, ends)]
 
     def _grow_for(self, points: int) -> None:
         """Room for `points` new voxels at a load of at most one half."""
@@ -138,25 +143,18 @@ class VoxelSums:
         _insert_all(self._keys, self._used, self._table)
 
 
-def _tile_sums(keys: NDArray[np.int64], records: NDArray[np.float64]) -> TileSums:
-    side = (1 << _SIDE_BITS) - 1
-    tile = int(keys[0] >> _TILE_SHIFT)
-    voxel = np.column_stack(
-        (
-            (keys >> (_SIDE_BITS + _HEIGHT_BITS)) & side,
-            (keys >> _HEIGHT_BITS) & side,
-            (keys & ((1 << _HEIGHT_BITS) - 1)) - _HEIGHT_HALF,
-        )
-    )
-    return TileSums(
-        tile=((tile >> _TILE_BITS) - _TILE_HALF, (tile & ((1 << _TILE_BITS) - 1)) - _TILE_HALF),
-        voxel=voxel.astype(np.int32),
-        count=records[:, _COUNT].astype(np.int32),
-        sum_m=records[:, :3] * STEP_M,
-        sum_intensity=records[:, _INTENSITY] * INTENSITY_STEP,
-        ground_count=records[:, _GROUND].astype(np.int32),
-        scan_count=records[:, _SCANS].astype(np.int32),
-    )
+class _Runs:
+    """Room for the runs of one scan: voxel, sums and place of each. Kept from scan to scan, since fresh memory is slow."""
+
+    def __init__(self, points: int) -> None:
+        self.keys = np.empty(points, np.int64)
+        self.sums = np.empty((points, 6))
+        self.rows = np.empty(points, np.int32)
+
+
+def _tile(key: int) -> tuple[int, int]:
+    tile = int(key) >> _TILE_SHIFT
+    return (tile >> _TILE_BITS) - _TILE_HALF, (tile & ((1 << _TILE_BITS) - 1)) - _TILE_HALF
 
 
 @kernel
@@ -183,17 +181,19 @@ def _insert_all(keys: NDArray[np.int64], used: int, table: NDArray[np.int64]) ->
 
 
 @kernel
-def _quantise(
+def _runs(
     xs: NDArray[np.float32], ys: NDArray[np.float32], zs: NDArray[np.float32], intensity: NDArray[np.float32],
     classes: NDArray[np.uint8], keep: NDArray[np.bool_], ground_class: int, T: NDArray[np.float64],
-    voxel_m: float, tile_m: float, side: int, keys: NDArray[np.int64], steps: NDArray[np.float32],
+    voxel_m: float, tile_m: float, side: int, keys: NDArray[np.int64], sums: NDArray[np.float64],
 ) -> int:  # fmt: skip
-    """Voxel and rounded coordinates of the kept points of one scan.
+    """Kept points of one scan, those that follow each other in one voxel added up: near the sensor most do.
 
-    Fills `keys` (n,) and `steps` (n, 5): x, y, z from the tile's corner and intensity in whole steps, 1 for ground;
-    returns their number, or -1 when a point is out of the grid.
+    Fills `keys` (n,) and `sums` (n, 6): x, y, z from the tile's corner and intensity in whole steps, points, points of
+    ground; returns their number, or -1 when a point is out of the grid.
     """
-    kept = 0
+    runs = 0
+    last = np.int64(_EMPTY)
+    sx, sy, sz, light, points, ground = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(len(xs)):
         if not keep[classes[i]]:
             continue
@@ -211,14 +211,22 @@ def _quantise(
         vy: Any = min(np.int64(y / voxel_m), side - 1)
         tile = ((np.int64(tx) + _TILE_HALF) << _TILE_BITS) | (np.int64(ty) + _TILE_HALF)
         inner = (((vx << _SIDE_BITS) | vy) << _HEIGHT_BITS) | (np.int64(vz) + _HEIGHT_HALF)
-        keys[kept] = (tile << _TILE_SHIFT) | inner
-        steps[kept, 0] = np.rint(x / STEP_M)
-        steps[kept, 1] = np.rint(y / STEP_M)
-        steps[kept, 2] = np.rint(z / STEP_M)
-        steps[kept, 3] = np.rint(intensity[i] / INTENSITY_STEP) if np.isfinite(intensity[i]) else 0.0
-        steps[kept, 4] = 1.0 if classes[i] == ground_class else 0.0
-        kept += 1
-    return kept
+        key = (tile << _TILE_SHIFT) | inner
+        if key != last:
+            last = key
+            runs += 1
+            keys[runs - 1] = key
+            sx, sy, sz, light, points, ground = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        sx += np.rint(x / STEP_M)
+        sy += np.rint(y / STEP_M)
+        sz += np.rint(z / STEP_M)
+        light += np.rint(intensity[i] / INTENSITY_STEP) if np.isfinite(intensity[i]) else 0.0
+        points += 1.0
+        ground += 1.0 if classes[i] == ground_class else 0.0
+        into = sums[runs - 1]
+        into[_X], into[_Y], into[_Z], into[_INTENSITY] = sx, sy, sz, light
+        into[_COUNT], into[_GROUND] = points, ground
+    return runs
 
 
 @kernel
@@ -229,7 +237,7 @@ def _find(
     keys: NDArray[np.int64],
     used: int,
 ) -> int:
-    """Number of the voxel of each point, new voxels included; returns the number of voxels.
+    """Number of the voxel of each run, new voxels included; returns the number of voxels.
 
     A loop of its own, short enough for the processor to wait for many cache lines at once.
     """
@@ -247,18 +255,28 @@ def _find(
 
 
 @kernel
-def _add(
-    rows: NDArray[np.int32], steps: NDArray[np.float32], records: NDArray[np.float64], scan: int
-) -> None:
-    """Add each point to its voxel."""
+def _add(rows: NDArray[np.int32], sums: NDArray[np.float64], records: NDArray[np.float64], scan: int) -> None:
+    """Add each run to its voxel."""
     for i in range(len(rows)):
         record = records[rows[i]]
-        record[_X] += steps[i, 0]
-        record[_Y] += steps[i, 1]
-        record[_Z] += steps[i, 2]
-        record[_INTENSITY] += steps[i, 3]
-        record[_COUNT] += 1.0
-        record[_GROUND] += steps[i, 4]
+        for k in range(6):
+            record[k] += sums[i, k]
         if record[_LAST] != scan:
             record[_SCANS] += 1.0
             record[_LAST] = scan
+
+
+@kernel
+def _columns(
+    order: NDArray[np.int64], records: NDArray[np.float64]
+) -> tuple[NDArray[np.int32], F8, F8, F8, F8, NDArray[np.int32], NDArray[np.int32]]:
+    """Columns of a piece but for the voxel, rows in this order."""
+    n = len(order)
+    count, ground, scans = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
+    x, y, z, intensity = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    for i in range(n):
+        record = records[order[i]]
+        x[i], y[i], z[i] = record[_X] * STEP_M, record[_Y] * STEP_M, record[_Z] * STEP_M
+        intensity[i] = record[_INTENSITY] * INTENSITY_STEP
+        count[i], ground[i], scans[i] = record[_COUNT], record[_GROUND], record[_SCANS]
+    return count, x, y, z, intensity, ground, scans

@@ -12,7 +12,7 @@ from scanloom.schemas.tiles import Piece
 from scanloom.stages.geometry.se3 import F8, pose, so3_exp, transform
 from scanloom.stages.tiling import tiling
 from scanloom.stages.tiling.pieces import Settings
-from scanloom.stages.tiling.voxel_sums import STEP_M
+from scanloom.stages.tiling.voxel_sums import STEP_M, voxel_indices
 from tests.stages.mapping import pieces_of, poses_of, stamps
 from tests.worlds import drive, street
 
@@ -50,7 +50,9 @@ def test_sums_equal_those_taken_point_by_point() -> None:
     got = {}
     for part in pieces_of(scans, T, settings):
         x, y = (int(v) for v in part.key.split("_"))
-        for voxel, count, total in zip(part.product.voxel, part.product.count, part.product.sum_m):
+        piece = part.product
+        sums = np.column_stack((piece.sum_x_m, piece.sum_y_m, piece.sum_z_m))
+        for voxel, count, total in zip(voxel_indices(piece.voxel), piece.count, sums):
             got[(x, y, *voxel)] = (count, total)
     want: dict[tuple[int, ...], list[F8]] = {}
     for scan, pose_ in zip(scans, T):
@@ -69,14 +71,14 @@ def test_sums_equal_those_taken_point_by_point() -> None:
 def test_points_on_borders_belong_to_the_tile_above() -> None:
     pieces = place(np.array([[50.0, 0.0, 0.0], [49.99, -0.01, -0.01], [-50.0, -50.0, 3.0], [0.0, 50.0, 0.1]]))
     assert sorted(pieces) == ["-1_-1", "0_-1", "0_1", "1_0"]
-    assert pieces["1_0"].voxel.tolist() == [[0, 0, 0]]
-    assert pieces["0_-1"].voxel.tolist() == [[499, 499, -1]]
-    assert pieces["-1_-1"].voxel.tolist() == [[0, 0, 30]]
+    assert voxel_indices(pieces["1_0"].voxel).tolist() == [[0, 0, 0]]
+    assert voxel_indices(pieces["0_-1"].voxel).tolist() == [[499, 499, -1]]
+    assert voxel_indices(pieces["-1_-1"].voxel).tolist() == [[0, 0, 30]]
 
 
 def test_a_hair_below_zero_stays_in_the_last_voxel() -> None:
     piece = place(np.array([[-1e-20, 1.0, 0.0]]))["-1_0"]
-    assert piece.voxel.tolist() == [[499, 10, 0]]
+    assert voxel_indices(piece.voxel).tolist() == [[499, 10, 0]]
 
 
 def test_pieces_come_ordered_and_repeat_bit_for_bit() -> None:
@@ -87,8 +89,9 @@ def test_pieces_come_ordered_and_repeat_bit_for_bit() -> None:
     assert any(x < 0 for x, _ in keys)
     assert any(y < 0 for _, y in keys)
     for a, b in zip(first, second):
-        assert a.product.sum_m.tobytes() == b.product.sum_m.tobytes()
-        voxels = [tuple(v) for v in a.product.voxel]
+        assert a.product.sum_x_m.tobytes() == b.product.sum_x_m.tobytes()
+        voxels = [tuple(v) for v in voxel_indices(a.product.voxel)]
+        assert [*a.product.voxel] == sorted(a.product.voxel)
         assert voxels == sorted(voxels)
         assert len(set(voxels)) == len(voxels)
 
