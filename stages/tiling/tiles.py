@@ -13,6 +13,7 @@ from scanloom.schemas.errors import StageError
 from scanloom.schemas.product import Parts, columns_of
 from scanloom.schemas.scans import PointClass
 from scanloom.schemas.tiles import Piece, Tile, TileFiles
+from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.tiling import ply
 from scanloom.stages.tiling.grid import tile_position
 
@@ -86,10 +87,15 @@ def merge(pieces: list[Piece]) -> Piece:
     return Piece(voxel=voxel[order[starts]], **sums, **pieces[0].attributes)
 
 
+@kernel
 def _sum_runs(values: NDArray, order: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray:
-    if len(starts) == 0:
-        return values[order]
-    return np.add.reduceat(values[order], starts).astype(values.dtype)
+    """Sum of the values in this order over each run from one start to the next."""
+    out = np.zeros(len(starts), values.dtype)
+    for run in range(len(starts)):
+        end = starts[run + 1] if run + 1 < len(starts) else len(order)
+        for i in range(starts[run], end):
+            out[run] += values[order[i]]
+    return out
 
 
 def _identity(pieces: Parts[Piece]) -> tuple[str, tuple[str, ...]]:
