@@ -33,9 +33,8 @@ OF_WINDOWS = (Track, TrackEnds)
 
 
 def _made() -> tuple[type[Product], ...]:
-    """What the measured stages and the comparison read. A drive is not cut into windows."""
+    """What the measured stages and the comparison read."""
     read = [product for name in MEASURED for product in NODE_OF[name].reads]
-    read = [product for product in read if "window" not in WRITER_OF[product].axes]
     return tuple(p for p in dict.fromkeys([*read, Truth]) if p not in OF_WINDOWS)
 
 
