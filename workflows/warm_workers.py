@@ -6,6 +6,7 @@ compiled kernels, and libraries that only late stages use.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import sys
@@ -39,8 +40,13 @@ def _first_kernel(kernels: Iterator[None]) -> None:
 _kernels = load_kernels()
 
 
+LOWEST_PRIORITY = 19
+
+
 def load_while_idle() -> None:
-    """Between tasks, one thing at a time: a task that begins waits for one of them at most."""
+    """Between tasks, one thing at a time: a task that begins waits for one of them at most. Other workers go first."""
+    with contextlib.suppress(AttributeError, OSError):  # threads have a priority of their own on Linux only
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOWEST_PRIORITY)
     for _ in _kernels:
         _wait()
     for name in LATER:

@@ -17,6 +17,7 @@ from scanloom.stages.geometry.se3 import F8
 
 F4 = NDArray[np.float32]
 B1 = NDArray[np.bool_]
+I2 = NDArray[np.int16]
 
 SECTORS = 180
 NEAR_M, MIDDLE_M, FAR_M = 20.0, 50.0, 120.0
@@ -46,45 +47,45 @@ def ground_mask(x_m: F4, y_m: F4, z_m: F4, usable: B1, R_level_lidar: F8, height
 
     Without ground around the sensor nothing is ground.
     """
-    lowest, highest = _extent(x_m, y_m, z_m, usable, R_level_lidar)
+    cell, outward, level = _cells(x_m, y_m, z_m, usable, R_level_lidar)
+    lowest, highest = _extent(cell, level)
     plane = seed_plane(lowest)
     if plane is None:
         return np.zeros(len(x_m), np.bool_)
     height = _without_strangers(_follow(lowest, highest, plane))
     slope = _fill(height, plane[0])
-    return _near(x_m, y_m, z_m, usable, R_level_lidar, height, slope, height_m)
+    return _near(cell, outward, level, height, slope, height_m)
 
 
 def seed_plane(lowest: F8) -> F8 | None:
     """Plane (3,) z = a + b x + c y around the sensor from the lowest heights of the cells, or None without ground."""
-    sector, bin_ = np.nonzero(np.isfinite(lowest) & (_bin_centers() < SEED_M) & (lowest < HIGHEST_GROUND_M))
-    if len(sector) < SEED_CELLS:
+    x, y = _seed_cells()
+    around = lowest[:, : x.shape[1]]
+    ground = around < HIGHEST_GROUND_M
+    if np.count_nonzero(ground) < SEED_CELLS:
         return None
-    z = lowest[sector, bin_]
-    x, y = (_bin_centers()[bin_] * d[sector] for d in _sector_directions())
-    edges = np.arange(z.min() - 0.1, z.max() + 0.3, 0.1)
-    count = np.convolve(np.histogram(z, edges)[0], (1, 2, 1), mode="same")
-    plane = np.array([edges[np.argmax(count)] + 0.05, 0.0, 0.0])
-    A = np.column_stack((np.ones(len(z)), x, y))
+    z = around[ground]
+    A = np.column_stack((np.ones(len(z)), x[ground], y[ground]))
+    start = z.min() - 0.1
+    count = np.convolve(np.bincount(((z - start) * 10.0).astype(np.int64)), (1, 2, 1), mode="same")
+    plane = np.array([start + 0.1 * np.argmax(count) + 0.05, 0.0, 0.0])
     for gate in FIT_GATES_M:
         near = np.abs(z - A @ plane) < gate
-        if near.sum() < SEED_CELLS:
+        if np.count_nonzero(near) < SEED_CELLS:
             break
-        fitted = np.linalg.lstsq(A[near], z[near], rcond=None)[0]
+        B = A[near].T
+        fitted = np.linalg.lstsq(B @ B.T, B @ z[near], rcond=None)[0]
         if np.hypot(fitted[1], fitted[2]) < STEEPEST:
             plane = fitted
     return plane
 
 
 @cache
-def _bin_centers() -> F8:
-    return np.array([_center(b) for b in range(BINS)])
-
-
-@cache
-def _sector_directions() -> tuple[F8, F8]:
+def _seed_cells() -> tuple[F8, F8]:
+    """x and y (SECTORS, bins nearer than SEED_M) of the middle of each cell, m."""
     direction = np.array([_direction(s) for s in range(SECTORS)])
-    return direction[:, 0], direction[:, 1]
+    center = np.array([_center(b) for b in range(BINS) if _center(b) < SEED_M])
+    return np.outer(direction[:, 0], center), np.outer(direction[:, 1], center)
 
 
 @kernel
@@ -127,23 +128,33 @@ def _direction(s: int) -> tuple[float, float]:
 
 
 @kernel
-def _extent(x: F4, y: F4, z: F4, usable: B1, R: F8) -> tuple[F8, F8]:
-    """Lowest and highest level height of the usable points of each cell (SECTORS, BINS), m; inf and -inf if none."""
-    lowest = np.full((SECTORS, BINS), np.inf)
-    highest = np.full((SECTORS, BINS), -np.inf)
+def _cells(x: F4, y: F4, z: F4, usable: B1, R: F8) -> tuple[I2, F4, F4]:
+    """For each point (n,) its cell, sector BINS + bin, -1 if it has none; how far beyond the cell's middle, m; its level height, m."""
+    cell = np.full(len(x), -1, np.int16)
+    outward, level = np.empty(len(x), np.float32), np.empty(len(x), np.float32)
     for i in range(len(x)):
         if not usable[i]:
             continue
         u = R[0, 0] * x[i] + R[0, 1] * y[i] + R[0, 2] * z[i]
         v = R[1, 0] * x[i] + R[1, 1] * y[i] + R[1, 2] * z[i]
-        w = R[2, 0] * x[i] + R[2, 1] * y[i] + R[2, 2] * z[i]
         r = np.sqrt(u * u + v * v)
-        if r >= FAR_M:
-            continue
-        s, b = _sector(u, v), _bin(r)
-        lowest[s, b] = min(lowest[s, b], w)
-        highest[s, b] = max(highest[s, b], w)
-    return lowest, highest
+        if r < FAR_M:
+            b = _bin(r)
+            cell[i] = _sector(u, v) * BINS + b
+            outward[i] = r - _center(b)
+            level[i] = R[2, 0] * x[i] + R[2, 1] * y[i] + R[2, 2] * z[i]
+    return cell, outward, level
+
+
+@kernel
+def _extent(cell: I2, level: F4) -> tuple[F8, F8]:
+    """Lowest and highest level height of the points of each cell (SECTORS, BINS), m; inf and -inf if none."""
+    lowest, highest = np.full(SECTORS * BINS, np.inf), np.full(SECTORS * BINS, -np.inf)
+    for i in range(len(cell)):
+        if cell[i] >= 0:
+            lowest[cell[i]] = min(lowest[cell[i]], level[i])
+            highest[cell[i]] = max(highest[cell[i]], level[i])
+    return lowest.reshape(SECTORS, BINS), highest.reshape(SECTORS, BINS)
 
 
 @kernel
@@ -215,18 +226,11 @@ def _fill(height: F8, at_sensor: float) -> F8:
 
 
 @kernel
-def _near(x: F4, y: F4, z: F4, usable: B1, R: F8, height: F8, slope: F8, tolerance: float) -> B1:
-    out = np.zeros(len(x), np.bool_)
-    for i in range(len(x)):
-        if not usable[i]:
-            continue
-        u = R[0, 0] * x[i] + R[0, 1] * y[i] + R[0, 2] * z[i]
-        v = R[1, 0] * x[i] + R[1, 1] * y[i] + R[1, 2] * z[i]
-        w = R[2, 0] * x[i] + R[2, 1] * y[i] + R[2, 2] * z[i]
-        r = np.sqrt(u * u + v * v)
-        if r >= FAR_M:
-            continue
-        s, b = _sector(u, v), _bin(r)
-        above = w - (height[s, b] + slope[s, b] * (r - _center(b)))
-        out[i] = -2.0 * tolerance < above < tolerance
+def _near(cell: I2, outward: F4, level: F4, height: F8, slope: F8, tolerance: float) -> B1:
+    out = np.zeros(len(cell), np.bool_)
+    heights, slopes = height.ravel(), slope.ravel()
+    for i in range(len(cell)):
+        if cell[i] >= 0:
+            above = level[i] - (heights[cell[i]] + slopes[cell[i]] * outward[i])
+            out[i] = -2.0 * tolerance < above < tolerance
     return out

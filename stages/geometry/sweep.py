@@ -177,18 +177,18 @@ def sweep_times(
 
 @kernel
 def _rows_by_wrap(x: NDArray[np.float32], y: NDArray[np.float32], least: int, out: NDArray[np.uint16]) -> int:
-    """Number of the row of each point: a new row where the azimuth in [0, 2 pi) falls by more than half a turn."""
+    """Number of the row of each point: a new row where the azimuth in [0, 2 pi) falls by more than half a turn.
+
+    That is from the right (y < 0) to the left, by more than half a turn clockwise: nowhere else it need be computed.
+    """
     row, since = 0, 0
-    last = 0.0
     for i in range(len(x)):
-        azimuth = _azimuth(y[i], x[i])
-        if azimuth < 0.0:
-            azimuth += 2 * np.pi
-        if i > 0 and last - azimuth > np.pi and since >= least:
-            row += 1
-            since = 0
+        if i > 0 and since >= least and y[i - 1] < 0.0 and not y[i] < 0.0:
+            fall = _azimuth(y[i - 1], x[i - 1]) + 2 * np.pi - _azimuth(y[i], x[i])
+            if fall > np.pi:
+                row += 1
+                since = 0
         since += 1
-        last = azimuth
         out[i] = row
     return row + 1 if len(x) > 0 else 0
 
