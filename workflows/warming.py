@@ -20,6 +20,8 @@ from scanloom.workflows.sessions import SAMPLE
 MARKER = "warm"
 PACKAGES = ("schemas", "stages", "pipeline", "workflows")
 BARE_SCANS = 12
+CHUNK_S = 2.0
+"""Several chunks, so that what merges them is compiled, too."""
 
 
 def is_warm() -> bool:
@@ -52,7 +54,7 @@ def _map(session: str, folder: Path) -> Result:
         name=Path(session).name,
         store=folder / "store",
         cluster="none",
-        command_line={"simulate": {"size": "small"}},
+        command_line={"simulate": {"size": "small"}, "ingest": {"chunk_s": CHUNK_S}},
     )
     outcome = build_map(order)
     for _, error in outcome.failures:
