@@ -11,6 +11,7 @@ from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.stages.geometry.motion import MotionTrack
 from scanloom.stages.geometry.se3 import F8, inverse, se3_exp, se3_log
 from scanloom.stages.odometry.slip import SlipGate
+from scanloom.stages.odometry.traction import WheelScale, without_slips
 
 GYRO_STD_RAD_PER_SQRT_S = 0.002
 WHEEL_STD_SHARE = 0.02
@@ -18,8 +19,6 @@ GUESS_RATE_STD_RAD_S = 0.5
 GUESS_ACCELERATION_STD_M_S2 = 3.0
 GUESS_SPEED_STD_M_S = 15.0
 SLIP_M_S = 0.5
-SCALE_PRIOR_M = 20.0
-SCALE_MEMORY_M = 500.0
 MIN_STEP_M = 0.1
 MAX_SCALE_ERROR = 0.1
 
@@ -44,23 +43,24 @@ class Predictor:
     """Expected motion between scans.
 
     Rotation from the gyro and translation from the wheels where they cover the time, else both at the rate of the
-    last registered motion. What the wheels say is bounded by the accelerometer. Their scale is estimated from well
-    registered scans: the ratio of sums of LiDAR and wheel displacement along x of the base, with a prior of 1 and a
-    memory of some hundred metres; steps where the two differ by more than 0.5 m/s are slip and left out (methods 1.8).
+    last registered motion. Slips of the wheels are taken out first, for the whole log (see `traction`); what is left of them
+    is bounded by the accelerometer. The wheels' scale is estimated from well registered scans: LiDAR over wheel displacement
+    along x of the base; steps where the two differ by more than 0.5 m/s are slip and left out (methods 1.8).
     """
 
     def __init__(self, session: Session, imu: Imu, wheel: Wheel) -> None:
-        self._track = MotionTrack.build(imu, wheel, session)
+        self._traction = without_slips(wheel, imu, session)
+        self._track = MotionTrack.build(imu, self._traction.wheel, session)
         self._T_base_lidar = np.array(session.T_base("lidar"))
         self._twist: F8 | None = None
         self._seen_ns: int | None = None
         self._gate = SlipGate(session, imu)
-        self._lidar_m = self._wheel_m = SCALE_PRIOR_M
+        self._scale = WheelScale()
 
     @property
     def wheel_scale(self) -> float:
         """LiDAR metres per wheel metre."""
-        return self._lidar_m / self._wheel_m
+        return self._scale.value
 
     def predict(self, last_ns: int, now_ns: int) -> Prediction:
         """Motion of the LiDAR between two reference times."""
@@ -84,7 +84,8 @@ class Predictor:
         self._gate.learn(self._forward(T_last_now) / dt, last_ns, now_ns, well_seen=well_seen)
         if well_seen:
             self._seen_ns = now_ns
-        if well_seen and self._track.covers(last_ns, now_ns).translation:
+        grip = self._track.covers(last_ns, now_ns).translation and not self._traction.slipped(last_ns, now_ns)
+        if well_seen and grip:
             self._learn_scale(
                 self._forward(self._track.relative(last_ns, now_ns)), self._forward(T_last_now), dt
             )
@@ -93,10 +94,7 @@ class Predictor:
         off = abs(lidar_m - self.wheel_scale * wheel_m)
         if abs(wheel_m) < MIN_STEP_M or off > min(SLIP_M_S * dt, MAX_SCALE_ERROR * abs(wheel_m)):
             return
-        self._lidar_m += abs(lidar_m)
-        self._wheel_m += abs(wheel_m)
-        forget = min(1.0, SCALE_MEMORY_M / self._wheel_m)
-        self._lidar_m, self._wheel_m = self._lidar_m * forget, self._wheel_m * forget
+        self._scale.learn(wheel_m, lidar_m)
 
     def _forward(self, T_lidar: F8) -> float:
         """Displacement of the base origin along x of the base."""
