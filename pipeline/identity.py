@@ -115,6 +115,11 @@ class Identifier:
             self._bytes[session] = sum(_stamp(path)[0] for files in sources for path in _paths(files))
         return self._bytes[session]
 
+    def foresee(self) -> None:
+        """Find the code versions of all stages: a tenth of a second that passes while the first tasks run, not between tasks."""
+        for node in self._flow.nodes:
+            self._code_of(node)
+
     def _code_of(self, node: Node) -> Json:
         if node.name not in self._code:
             self._code[node.name] = code_version(node.stage, node.version)

@@ -163,6 +163,7 @@ class Driver:
             self._look_up()
             while self._ready or self._running:
                 self._submit()
+                self._identifier.foresee()
                 self._collect()
                 self._look_up()
             state = "finished"
