@@ -45,14 +45,16 @@ def windows(settings: Cutting, scans: Parts[Scans]) -> Iterator[Part[Window]]:
 
 
 def cut(stamp_ns: NDArray[np.int64], count: int, overlap_s: float) -> list[Window]:
-    """At most `count` stretches of equal number of scans, each reaching `overlap_s` back into the one before it.
+    """At most `count` stretches, each reaching `overlap_s` back into the one before it, with equal numbers of scans to track.
 
-    It reaches back by some scans at least, also over a pause, and never beyond the window before it.
+    A stretch reaches back by some scans at least, also over a pause, and never beyond the window before it.
     """
     n = len(stamp_ns)
     length_s = 1e-9 * float(stamp_ns[-1] - stamp_ns[0]) if n else 0.0
     most = min(int(length_s / (LEAST_LENGTHS * overlap_s)), n // (LEAST_LENGTHS * LEAST_SCANS))
-    edges = np.round(np.linspace(0, n, max(1, min(count, most)) + 1)).astype(int)
+    reach = n * overlap_s / length_s if most > 1 else 0.0
+    edges = np.round(np.linspace(reach, n, max(1, min(count, most)) + 1)).astype(int)
+    edges[0] = 0
     found = [Window(first=0, own=0, last=int(edges[1]))]
     for before, own, last in zip(edges[:-2], edges[1:-1], edges[2:], strict=True):
         back = int(np.searchsorted(stamp_ns, stamp_ns[own] - round(overlap_s * 1e9)))

@@ -32,7 +32,9 @@ def times(count: int) -> np.ndarray:
 
 
 def test_windows_reach_back_and_own_every_scan_once() -> None:
-    assert cut(times(90), 3, 1.0) == [window(0, 0, 30), window(20, 30, 60), window(50, 60, 90)]
+    found = cut(times(90), 3, 1.0)
+    assert found == [window(0, 0, 37), window(27, 37, 63), window(53, 63, 90)]
+    assert [w.last - w.first for w in found] == [37, 36, 37], "none has more to track than another"
 
 
 def test_a_session_too_short_for_its_overlaps_has_fewer_windows() -> None:
@@ -45,8 +47,8 @@ def test_a_session_too_short_for_its_overlaps_has_fewer_windows() -> None:
 
 def test_a_window_reaches_back_over_a_pause_but_not_beyond_the_window_before() -> None:
     stamps = times(60)
-    stamps[30:] += 10**10
-    assert cut(stamps, 2, 1.0) == [window(0, 0, 30), window(20, 30, 60)]
+    stamps[32:] += 10**10
+    assert cut(stamps, 2, 1.0) == [window(0, 0, 32), window(22, 32, 60)]
     crowded = np.concatenate((times(10) - 10**12, times(50)[:40] // 10 + 9 * 10**17, times(50)[40:]))
     assert all(b.first >= a.own for a, b in itertools.pairwise(cut(crowded, 3, 300.0)))
 
@@ -65,9 +67,9 @@ def test_the_windows_of_a_session_know_their_chunks() -> None:
     found = list(windows(CUT, scans))
     assert [part.key for part in found] == ["0000", "0001", "0002"]
     assert [part.product for part in found] == [
-        window(0, 0, 30),
-        window(20, 30, 60, chunk=1, chunk_first=20),
-        window(50, 60, 90, chunk=2, chunk_first=40),
+        window(0, 0, 37),
+        window(27, 37, 63, chunk=1, chunk_first=20),
+        window(53, 63, 90, chunk=2, chunk_first=40),
     ]
 
 
@@ -191,15 +193,19 @@ def test_one_window_is_the_uncut_run(rides: list[Drive], whole: list[Odometry]) 
 
 def test_windows_without_a_common_scan_become_segments(rides: list[Drive]) -> None:
     """No scan of the overlap was registered in both windows: what lies between them is said to be unknown."""
-    ride = rides[0]
+    ride, halves = rides[0], Settings(windows=2, window_overlap_s=1.0)
+    second = cut(times(44), 2, 1.0)[1]
+    first, own = second.first, second.own
     blind = [
         dataclasses.replace(s, **{name: getattr(s, name)[:0] for name in columns_of(DeskewedScan)})
-        for s in ride.scans[12:22]
+        for s in ride.scans[first:own]
     ]
-    ride = dataclasses.replace(ride, scans=ride.scans[:12] + blind + ride.scans[22:44], truth=ride.truth[:44])
-    track = ride.run(Settings(windows=2, window_overlap_s=1.0), sensors=False)
+    ride = dataclasses.replace(
+        ride, scans=ride.scans[:first] + blind + ride.scans[own:44], truth=ride.truth[:44]
+    )
+    track = ride.run(halves, sensors=False)
     border = np.flatnonzero(np.diff(track.segment)) + 1
-    assert 22 in border
-    assert not track.reliable[22]
-    assert track.keyframe[21:23].all()
-    assert np.sqrt(track.covariance[22, 3, 3]) > 5
+    assert own in border
+    assert not track.reliable[own]
+    assert track.keyframe[own - 1 : own + 1].all()
+    assert np.sqrt(track.covariance[own, 3, 3]) > 5
