@@ -13,6 +13,7 @@ from scanloom.stages.geometry.se3 import F8, pose, so3_exp
 
 MOST_ANCHORS = 40
 MOST_VOTERS = 1000
+PAIRS_AT_ONCE = 100
 INDEPENDENT_M = 5.0
 """Fixes nearer to each other than this share their errors and count as one for the certainty of the heading."""
 
@@ -38,30 +39,46 @@ def align_level(level: F8, world: F8, sigma_m: F8, travelled_m: F8, drift: float
     sigma_m : (n,) horizontal standard deviation of each position.
     travelled_m : (n,) path length at each position.
     """
-    anchors = np.unique(np.linspace(0, len(level) - 1, min(MOST_ANCHORS, len(level))).astype(np.int64))
-    voters = np.unique(np.linspace(0, len(level) - 1, min(MOST_VOTERS, len(level))).astype(np.int64))
-    best: tuple[int, F8, int, int] | None = None
-    for a, b in combinations(anchors, 2):
-        if np.linalg.norm(world[b, :2] - world[a, :2]) < 4.0 * np.hypot(sigma_m[a], sigma_m[b]):
-            continue
-        T = _from_pair(level, world, a, b)
-        agree = _agreement(
-            T, level[voters], world[voters], sigma_m[voters], drift * _apart(travelled_m, voters, a, b)
-        )
-        if best is None or agree.sum() > best[0]:
-            best = int(agree.sum()), T, int(a), int(b)
-    if best is None or best[0] < 2:
+    anchors = _spread(len(level), MOST_ANCHORS)
+    pair = np.array(list(combinations(anchors, 2)), np.int64).reshape(-1, 2)
+    far = np.linalg.norm(world[pair[:, 1], :2] - world[pair[:, 0], :2], axis=1)
+    pair = pair[far >= 4.0 * np.hypot(sigma_m[pair[:, 0]], sigma_m[pair[:, 1]])]
+    votes = _votes(pair, _spread(len(level), MOST_VOTERS), level, world, sigma_m, travelled_m, drift)
+    if len(votes) == 0 or votes.max() < 2:
         return None
-    every = np.arange(len(level))
-    inliers = _agreement(best[1], level, world, sigma_m, drift * _apart(travelled_m, every, *best[2:]))
+    best = pair[np.argmax(votes)]
+    T = fit_level(level[best], world[best], np.ones(2))
+    inliers = _agreement(T, level, world, sigma_m, drift * _apart(travelled_m, travelled_m[best]))
     T = fit_level(level[inliers], world[inliers], 1.0 / sigma_m[inliers] ** 2)
     return Alignment(T, inliers, _heading_sigma(level[inliers], sigma_m[inliers], travelled_m[inliers]))
 
 
-def _apart(travelled_m: F8, rows: I8, a: int, b: int) -> F8:
-    """Path from each of the rows to the nearer one of a and b."""
-    at = travelled_m[rows]
-    return np.asarray(np.minimum(np.abs(at - travelled_m[a]), np.abs(at - travelled_m[b])))
+def _spread(count: int, most: int) -> I8:
+    """Up to `most` numbers from 0 to count - 1, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(np.int64))
+
+
+def _votes(
+    pair: I8, voters: I8, level: F8, world: F8, sigma_m: F8, travelled_m: F8, drift: float
+) -> NDArray[np.int64]:
+    """How many voters agree with what each pair (m, 2) proposes. Positions in the plane as complex numbers."""
+    p, q = level[:, 0] + 1j * level[:, 1], world[:, 0] + 1j * world[:, 1]
+    votes = np.zeros(len(pair), np.int64)
+    for first in range(0, len(pair), PAIRS_AT_ONCE):
+        a, b = pair[first : first + PAIRS_AT_ONCE].T
+        turn = (q[b] - q[a]) * np.conj(p[b] - p[a])
+        turn /= np.maximum(np.abs(turn), 1e-300)
+        shift = 0.5 * (q[a] + q[b] - turn * (p[a] + p[b]))
+        off = np.abs(turn[:, None] * p[voters] + shift[:, None] - q[voters])
+        ends = travelled_m[pair[first : first + PAIRS_AT_ONCE]]
+        allowed = 3.0 * sigma_m[voters] + drift * np.array([_apart(travelled_m[voters], e) for e in ends])
+        votes[first : first + PAIRS_AT_ONCE] = (off < allowed).sum(axis=1)
+    return votes
+
+
+def _apart(travelled_m: F8, ends_m: F8) -> F8:
+    """Path from each of the places to the nearer one of two."""
+    return np.asarray(np.minimum(np.abs(travelled_m - ends_m[0]), np.abs(travelled_m - ends_m[1])))
 
 
 def _agreement(T: F8, level: F8, world: F8, sigma_m: F8, allowed_m: F8) -> NDArray[np.bool_]:
@@ -77,11 +94,6 @@ def fit_level(level: F8, world: F8, weight: F8) -> F8:
     cosine = np.sum(w * (a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]))
     R = so3_exp([0.0, 0.0, np.arctan2(sine, cosine)])
     return pose(R, w @ world - R @ (w @ level))
-
-
-def _from_pair(level: F8, world: F8, a: int, b: int) -> F8:
-    rows: I8 = np.array([a, b])
-    return fit_level(level[rows], world[rows], np.ones(2))
 
 
 def _heading_sigma(level: F8, sigma_m: F8, travelled_m: F8) -> float:
