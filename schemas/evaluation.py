@@ -41,7 +41,14 @@ class ErrorTrack(Table):
 
 
 @dataclass(frozen=True)
+class PictureFiles(Files):
+    """The map from above: `preview.png` with the trajectory on it, `plain.jpg` without, `overlay.svg` the marks alone."""
+
+    NAME: ClassVar[str] = "picture_files"
+
+
+@dataclass(frozen=True)
 class ReportFiles(Files):
-    """`preview.png` and `body.html`: what a report shows that does not vary from run to run."""
+    """`body.html`: what a report shows that does not vary from run to run."""
 
     NAME: ClassVar[str] = "report_files"

@@ -15,7 +15,7 @@ import numpy as np
 
 from scanloom.pipeline.run import Result
 from scanloom.schemas.errors import StoreError, UsageError
-from scanloom.schemas.evaluation import Metrics, ReportFiles
+from scanloom.schemas.evaluation import Metrics, PictureFiles
 from scanloom.schemas.session import Session
 from scanloom.schemas.tiles import MapFiles, Tile, TileFiles, TileIndex
 from scanloom.schemas.trajectory import Poses
@@ -112,7 +112,7 @@ def _items(result: Result) -> Iterable[Item]:
         stem = "trajectory" if len(sessions) == 1 else f"trajectory/{dict(coordinate)['session']}"
         yield Item(f"{stem}.parquet", path)
         yield Item(f"{stem}.tum", trajectory_tum(Poses.open(path)))
-    for _, path in result.files(ReportFiles):
+    for _, path in result.files(PictureFiles):
         yield Item("preview.png", path / "preview.png")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from scanloom.pipeline.node import Node, node
-from scanloom.schemas.evaluation import ErrorTrack, Metrics, ReportFiles
+from scanloom.schemas.evaluation import ErrorTrack, Metrics, PictureFiles, ReportFiles
 from scanloom.schemas.loops import Loops, Places
 from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.rig import SensorCheck
@@ -23,7 +23,7 @@ from scanloom.stages.loops.places import places
 from scanloom.stages.odometry import odometry
 from scanloom.stages.odometry.tracking import track
 from scanloom.stages.odometry.windows import windows
-from scanloom.stages.report import report
+from scanloom.stages.report import picture, report
 from scanloom.stages.sensors import sensors
 from scanloom.stages.simulate import simulate
 from scanloom.stages.tiling import overview, tiles, tiling
@@ -50,6 +50,7 @@ NODES: tuple[Node, ...] = (
     node("tiles",      tiles,      per="tile",    reads=(Piece,),                              writes=(Tile, TileFiles)),
     node("overview",   overview,   per="map",     reads=(Tile,),                               writes=(TileIndex, MapFiles)),
     node("evaluation", evaluation, per="map",     reads=(Session, Truth, Odometry, Poses, Loops, Tile, SensorCheck), writes=(Metrics, ErrorTrack)),
-    node("report",     report,     per="map",     reads=(Session, Metrics, ErrorTrack, Poses, Loops, TileIndex, Tile, Gnss, SensorCheck), writes=ReportFiles),
+    node("picture",    picture,    per="map",     reads=(Session, Poses, Loops, TileIndex, Tile, Gnss), writes=PictureFiles),
+    node("report",     report,     per="map",     reads=(Session, Metrics, ErrorTrack, Poses, Loops, TileIndex, PictureFiles, Gnss, SensorCheck), writes=ReportFiles),
 )
 # fmt: on

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanloom.schemas.frames import Georeference
+from scanloom.schemas.product import Parts
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Gnss
 from scanloom.schemas.trajectory import Poses
@@ -46,3 +47,11 @@ def gnss_agreement(gnss: Gnss, poses: Poses, session: Session) -> Agreement:
     T_lidar_gnss = inverse(np.array(session.T_base("lidar"))) @ np.array(session.T_base("gnss"))
     antenna = interpolate_poses(poses.stamp_ns, poses.T_world_lidar, stamps[covered]) @ T_lidar_gnss
     return Agreement(fixes, np.linalg.norm((fixes[covered] - antenna[:, :3, 3])[:, :2], axis=1))
+
+
+def gnss_agreements(
+    sessions: dict[str, Session], paths: dict[str, Poses], gnss: Parts[Gnss]
+) -> dict[str, Agreement]:
+    """`gnss_agreement` of every session that has poses and fixes."""
+    fixes = {c["session"]: g for c, g in gnss.items()}
+    return {name: gnss_agreement(fixes[name], paths[name], sessions[name]) for name in paths if name in fixes}

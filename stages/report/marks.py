@@ -17,7 +17,7 @@ from scanloom.stages.report.overlay import (
     Mark,
     view_unit,
 )
-from scanloom.stages.report.picture import View
+from scanloom.stages.report.raster import View
 
 _MAX_PATH_POINTS = 4000
 _MAX_FIXES = 1500

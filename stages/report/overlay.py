@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from scanloom.stages.report.picture import View
+from scanloom.stages.report.raster import View
 
 SESSION_COLOURS = ("#ff7a45", "#4cc9f0", "#f72585", "#b8f04c", "#c77dff", "#ffd166")
 LOOP_COLOUR = "#7CFC98"

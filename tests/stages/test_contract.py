@@ -30,6 +30,7 @@ CONTENT_WITH_NOTHING = {
     "overview",
     "tiles",
     "evaluation",
+    "picture",
     "report",
     "loops",
     "tiling",

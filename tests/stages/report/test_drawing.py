@@ -8,7 +8,7 @@ import pytest
 from scanloom.stages.report.charts import Curve, line_chart, nice_top, thin, ticks
 from scanloom.stages.report.figures import number
 from scanloom.stages.report.overlay import round_length
-from scanloom.stages.report.picture import fit_view
+from scanloom.stages.report.raster import fit_view
 
 
 def test_a_view_shows_the_rectangle_and_its_margin() -> None:

@@ -24,7 +24,8 @@ from scanloom.stages.evaluation import evaluation
 from scanloom.stages.evaluation.stage import Settings as EvaluationSettings
 from scanloom.stages.geometry.geodesy import georeference, world_to_geodetic
 from scanloom.stages.geometry.se3 import F8
-from scanloom.stages.report import report
+from scanloom.stages.report import picture, report
+from scanloom.stages.report.map_picture import Settings as PictureSettings
 from scanloom.stages.report.page import compose, fleet_page, run_section
 from scanloom.stages.report.stage import Settings
 from scanloom.stages.tiling import overview
@@ -79,6 +80,9 @@ def parse(page: str) -> Balanced:
     return parser
 
 
+DRAWN = ("session", "poses", "loops", "tile_index", "tiles", "gnss")
+
+
 class Map:
     """A mapped street and what the report reads of it; any product can be replaced."""
 
@@ -92,9 +96,11 @@ class Map:
             "session": one(session_of(scans=5)), "metrics": None, "error_track": None, "poses": one(poses_of(self.T)),
             "loops": Loops.empty(), "tile_index": self.index, "tiles": self.tiles, "gnss": one(no_gnss()), **changed,
         }  # fmt: skip
+        self.drawn = picture(PictureSettings(longest_px=400), **{name: given[name] for name in DRAWN})
         if given["metrics"] is None:
             given["metrics"], given["error_track"] = self.evaluate(given)
-        return report(Settings(picture_px=400), **given)
+        del given["tiles"]
+        return report(Settings(), picture=self.drawn, **given)
 
     def evaluate(
         self, given: dict[str, Any], odometry: F8 | None = None
@@ -116,9 +122,9 @@ def body(files: ReportFiles) -> str:
 
 
 def test_the_same_map_gives_the_same_bytes(street_map: Map) -> None:
-    one_, two = street_map.report(), street_map.report()
-    assert one_.read("body.html") == two.read("body.html")
-    assert one_.read("preview.png") == two.read("preview.png")
+    one_, drawn = street_map.report(), street_map.drawn
+    assert one_.read("body.html") == street_map.report().read("body.html")
+    assert drawn.read("preview.png") == street_map.drawn.read("preview.png")
 
 
 def test_the_page_is_one_file_without_outside_references(street_map: Map) -> None:
@@ -140,7 +146,8 @@ def test_a_good_map_is_called_good_and_says_why(street_map: Map) -> None:
 
 
 def test_the_picture_shows_walls_ground_and_emptiness(street_map: Map) -> None:
-    image = np.asarray(Image.open(io.BytesIO(street_map.report().read("preview.png"))))
+    street_map.report()
+    image = np.asarray(Image.open(io.BytesIO(street_map.drawn.read("preview.png"))))
     assert 300 <= max(image.shape[:2]) <= 420
     dark = (image.astype(int).sum(axis=2) < 70).mean()
     assert 0.1 < dark < 0.95
@@ -218,7 +225,7 @@ def test_no_truth_no_tiles_one_scan_still_give_a_page(street_map: Map) -> None:
         assert "Poor" in text
         assert "The map holds no points" in text
         assert "No truth was given" in text
-        assert Image.open(io.BytesIO(files.read("preview.png"))).size[0] >= 16
+        assert Image.open(io.BytesIO(street_map.drawn.read("preview.png"))).size[0] >= 16
 
 
 def test_two_sessions_have_two_colours_and_two_tables(street_map: Map) -> None:

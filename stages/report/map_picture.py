@@ -1,0 +1,88 @@
+"""Picture: the map from above, with the trajectory, loops and GNSS on it."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from pydantic import BaseModel, ConfigDict, Field
+
+from scanloom.schemas.evaluation import PictureFiles
+from scanloom.schemas.loops import Loops
+from scanloom.schemas.product import Parts
+from scanloom.schemas.session import Session
+from scanloom.schemas.tiles import Tile, TileIndex
+from scanloom.schemas.tracks import Gnss
+from scanloom.schemas.trajectory import Poses
+from scanloom.stages.report.gnss_agreement import gnss_agreements
+from scanloom.stages.report.marks import map_marks
+from scanloom.stages.report.overlay import Mark, paint, scale_bar, to_svg
+from scanloom.stages.report.raster import View, draw_map, fit_view
+
+VERSION = 1
+
+PREVIEW, PLAIN, OVERLAY = "preview.png", "plain.jpg", "overlay.svg"
+
+
+class Settings(BaseModel):
+    """What the picture shows."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    longest_px: int = Field(1600, ge=200, le=8000, description="longer side of the map's picture, pixels")
+    margin_m: float = Field(
+        40.0, ge=0.0, le=1000.0, description="what the picture shows around the trajectory, m"
+    )
+
+
+def picture(
+    settings: Settings,
+    session: Parts[Session],
+    poses: Parts[Poses],
+    loops: Loops,
+    tile_index: TileIndex,
+    tiles: Parts[Tile],
+    gnss: Parts[Gnss],
+) -> PictureFiles:
+    """Draw the map, tile by tile, and what lies on it."""
+    sessions = {c["session"]: s for c, s in session.items()}
+    paths = {c["session"]: p for c, p in poses.items()}
+    view = _view(settings, paths, tile_index)
+    plain, view = _enlarge(draw_map(tiles, view), view, settings.longest_px)
+    fixes = {name: found.fixes for name, found in gnss_agreements(sessions, paths, gnss).items()}
+    marks: list[Mark] = map_marks(view, paths, loops, fixes) + scale_bar(view)
+    return PictureFiles(
+        contents={
+            PREVIEW: _encoded(paint(plain, marks), "PNG", compress_level=3),
+            PLAIN: _encoded(Image.fromarray(plain), "JPEG", quality=88),
+            OVERLAY: to_svg(marks, view).encode(),
+        }
+    )
+
+
+def _enlarge(picture: NDArray[np.uint8], view: View, longest: int) -> tuple[NDArray[np.uint8], View]:
+    """A small map with larger pixels, so that lines and letters on it are sharp."""
+    factor = max(longest // max(view.width, view.height), 1)
+    enlarged = view.enlarged(factor)
+    image = Image.fromarray(picture).resize((enlarged.width, enlarged.height), Image.Resampling.BICUBIC)
+    return np.asarray(image), enlarged
+
+
+def _view(settings: Settings, paths: dict[str, Poses], index: TileIndex) -> View:
+    """Around the trajectories; without any, around the tiles."""
+    driven = [p.T_world_lidar[:, :2, 3] for p in paths.values() if len(p)]
+    corners = np.concatenate(driven) if driven else np.concatenate((index.min_m, index.max_m))[:, :2]
+    if len(corners) == 0:
+        corners = np.zeros((1, 2))
+    finest_m = 1.25 * index.voxel_size_m
+    return fit_view(
+        corners.min(axis=0), corners.max(axis=0), settings.margin_m, settings.longest_px, finest_m
+    )
+
+
+def _encoded(image: Image.Image, kind: str, **options: int) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, kind, **options)
+    return buffer.getvalue()
