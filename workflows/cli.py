@@ -7,6 +7,7 @@ import logging
 import os
 import sys
 import time
+from gc import set_threshold
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -40,9 +41,13 @@ ProjectOption = Annotated[
     Path | None, typer.Option("--project", help="Settings file (default ./scanloom.yaml when present).")
 ]
 
+OBJECTS_BETWEEN_COLLECTIONS = 100_000
+"""Imports make many objects that stay; looking for garbage among them every 700 objects took a quarter of their time."""
+
 
 def main() -> None:
     """Entry point: errors become one clear sentence and an exit code."""
+    set_threshold(OBJECTS_BETWEEN_COLLECTIONS)
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
     logging.getLogger("scanloom").setLevel(logging.INFO)
     try:

@@ -76,3 +76,15 @@ def test_modules_are_compiled_also_where_python_is_told_not_to(tmp_path, monkeyp
     assert len(list(tmp_path.glob("__pycache__/thing.*.pyc"))) == 1
     (tmp_path / "thing.py").write_text("A = (\n")
     warming.compile_modules()  # what does not compile says so when it is imported
+
+
+def test_garbage_is_collected_in_workers_only():
+    code = """
+import gc, os
+import scanloom.pipeline.local_worker
+child = os.fork()
+if not child:
+    os._exit(gc.isenabled() and gc.get_freeze_count() > 1000)
+print(gc.isenabled(), os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+    assert run_python(code) == "False 1"
