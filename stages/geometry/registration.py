@@ -1,23 +1,25 @@
 """Registration of a scan to a local map: robust Gauss-Newton on SE(3), point to plane or plane to plane.
 
-Residuals, their derivatives and weights are in `residuals`.
+Residuals, their derivatives and weights are in `residuals`, the steps in `descent`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scanloom.stages.geometry.descent import Sums, descend, linearise
 from scanloom.stages.geometry.halves import in_halves
 from scanloom.stages.geometry.kernels import kernel
-from scanloom.stages.geometry.residuals import linearise_planes, linearise_points
-from scanloom.stages.geometry.se3 import F8, inverse, se3_exp, se3_log
+from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.surfel_map import SurfelMap
 from scanloom.stages.geometry.voxel_map import F4, I4, I8, STEPS, VoxelMap, fit_surface, nearest
 from scanloom.stages.geometry.voxels import Float, Int, unpack
 
-__all__ = ["Registration", "VoxelMap", "align", "normals_at"]
+__all__ = ["Registration", "SurfelMap", "VoxelMap", "align", "normals_at"]
 
 ROTATION_STEP_RAD = 5e-5
 TRANSLATION_STEP_M = 1e-3
@@ -26,6 +28,9 @@ SETTLING = 8
 SETTLED = 10.0
 """Partners may swap to and fro for ever: after this many searches, steps this many times larger count as none."""
 MIN_MATCHES = 20
+FEW, AFTER_FEW = 600, 20.0
+"""So many points, at least, go first; what they leave to all points is small, and partners are then kept."""
+NO_NORMALS, ALL_DIRECTIONS, NOTHING_KNOWN = np.zeros((0, 3)), np.eye(6), np.zeros((6, 6))
 BOUND_SLACK, BOUND_SLACK_M2 = 1.0 + 1e-6, 1e-9
 
 
@@ -65,7 +70,7 @@ class Registration:
 
 
 def align(
-    target: VoxelMap,
+    target: VoxelMap | SurfelMap,
     source: ArrayLike,
     T_target_source: ArrayLike,
     *,
@@ -75,6 +80,7 @@ def align(
     free: F8 | None = None,
     source_normals: F8 | None = None,
     held: F8 | None = None,
+    few_first: int = 1,
 ) -> Registration:
     """Move `source` (n, 3), m, from the initial pose (4, 4) onto the surfaces of `target`.
 
@@ -87,67 +93,78 @@ def align(
         residuals are plane to plane (see the module).
     held : (6, 6) information of the initial pose, rad-2, m-2, right tangent: how well it was known before. The result is
         then the most probable pose; `information` and `gradient` are those of the scan alone.
+    few_first : every so many-th point alone is moved first, as far as it goes; all points then have little left to do.
 
     Few partners give `converged=False` and the best pose so far; nothing is raised.
     """
     points = np.ascontiguousarray(source, dtype=np.float64).reshape(-1, 3)
     T = np.array(T_target_source, dtype=np.float64)
-    partner = _Partners(points, source_normals)
-    expected, known = T, None if held is None else np.asarray(held, float)
-    basis = np.eye(6) if free is None else np.asarray(free, float)
-    converged, iterations = False, 0
-    H, b, residual = np.zeros((6, 6)), np.zeros(6), _Residuals()
-    while iterations < max_iterations and not converged:
-        iterations += 1
+    normals = NO_NORMALS if source_normals is None else np.ascontiguousarray(source_normals, dtype=np.float64)
+    knowledge = _Knowledge.of(free, held, T)
+    iterations = 0
+    tolerance = 1.0
+    if few_first > 1 and len(points) >= few_first * FEW:
+        few = _Partners(np.ascontiguousarray(points[::few_first]), np.ascontiguousarray(normals[::few_first]))
+        T, _, iterations = _settle(
+            few, target, T, max_distance_m, scale_m, max_iterations - 1, knowledge, 1.0
+        )
+        tolerance = AFTER_FEW
+    partner = _Partners(points, normals)
+    T, converged, more = _settle(
+        partner, target, T, max_distance_m, scale_m, max_iterations - iterations, knowledge, tolerance
+    )
+    H, b, residual = partner.linearise(T, scale_m)
+    return _result(T, H, b, residual, partner, converged, iterations + more)
+
+
+class _Knowledge(NamedTuple):
+    """Directions (6, k) in which the pose may move, and what was known of it: information (6, 6), zero for nothing, and pose."""
+
+    basis: F8
+    information: F8
+    T: F8
+
+    @classmethod
+    def of(cls, free: F8 | None, held: F8 | None, T: F8) -> _Knowledge:
+        basis = ALL_DIRECTIONS if free is None else np.ascontiguousarray(free, dtype=np.float64)
+        information = NOTHING_KNOWN if held is None else np.ascontiguousarray(held, dtype=np.float64)
+        return cls(basis, information, T)
+
+
+def _settle(
+    partner: _Partners, target: VoxelMap | SurfelMap, T: F8, max_distance_m: float, scale_m: float, most: int,
+    knowledge: _Knowledge, tolerance: float,
+) -> tuple[F8, bool, int]:  # fmt: skip
+    """Partners are searched, the pose moved, again and again until it stays: the pose, whether it stayed, searches."""
+    converged, searches = False, 0
+    while searches < most and not converged:
+        searches += 1
         partner.search(target, T, max_distance_m)
         start = T
-        for _ in range(INNER_STEPS):
-            H, b, residual = partner.linearise(T, scale_m)
-            if residual.matches < MIN_MATCHES:
-                break
-            if known is not None:
-                H, b = _with_knowledge(H, b, residual.sigma2, known, expected, T)
-            step = _step(H, b, basis)
-            T = T @ se3_exp(step)
-            if _small(step):
-                break
-        tolerance = 1.0 if iterations <= SETTLING else SETTLED
-        converged = residual.matches >= MIN_MATCHES and _close(start, T, tolerance)
-    H, b, residual = partner.linearise(T, scale_m)
-    return _result(T, H, b, residual, partner, converged, iterations)
+        T, matches = partner.descend(T, scale_m, knowledge)
+        if searches > SETTLING:
+            tolerance = SETTLED
+        converged = matches >= MIN_MATCHES and _close(start, T, tolerance)
+    return T, converged, searches
 
 
 def normals_at(points: ArrayLike, surface_points: F8, voxel_size_m: float) -> F8:
     """Unit normals (n, 3) of the surfaces through `points` (n, 3), m, among `surface_points` (m, 3); zero without one."""
     around = VoxelMap(voxel_size_m)
     around.insert(surface_points)
-    partner = _Partners(np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3))
+    partner = _Partners(np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3), NO_NORMALS)
     partner.search(around, np.eye(4), voxel_size_m)
     normals: F8 = np.where(partner.shape[:, None] > 0, partner.normal, 0.0)
     return normals
 
 
-@dataclass(frozen=True)
-class _Residuals:
-    matches: int = 0
-    weight: float = 0.0
-    weighted_square: float = 0.0
-    inliers: int = 0
-    inlier_square: float = 0.0
-
-    @property
-    def sigma2(self) -> float:
-        freedom = self.weight - 6
-        return self.weighted_square / freedom if freedom > 0 else float("inf")
-
-
 class _Partners:
     """For each source point: mean and direction of its partner's surface in the target, and the weight of its shape."""
 
-    def __init__(self, points: F8, normals: F8 | None = None) -> None:
+    def __init__(self, points: F8, normals: F8) -> None:
         n = len(points)
         self.points = points
-        self.point_normal = None if normals is None else np.ascontiguousarray(normals, dtype=np.float64)
+        self.point_normal = normals
         self.voxel = np.full(n, -1, np.int64)
         self.place = np.zeros(n, np.int64)
         self.mean = np.zeros((n, 3))
@@ -157,8 +174,13 @@ class _Partners:
         self.error = np.zeros(n)
         self.weight = np.zeros(n)
 
-    def search(self, target: VoxelMap, T: F8, max_distance_m: float) -> None:
+    def search(self, target: VoxelMap | SurfelMap, T: F8, max_distance_m: float) -> None:
         points = self.points
+        if isinstance(target, SurfelMap):
+            target.partners(
+                points, T, max_distance_m, self.mean, self.normal, self.shape, self.normal_variance
+            )
+            return
         size = target.voxel_size_m
         table = (target.keys, target.values, target.voxel_key, target.count, target.offset)
         limit2 = min(max_distance_m, size) ** 2
@@ -178,65 +200,95 @@ class _Partners:
             self.normal_variance,
         )  # fmt: skip
 
-    def linearise(self, T: F8, scale_m: float) -> tuple[F8, F8, _Residuals]:
+    def descend(self, T: F8, scale_m: float, knowledge: _Knowledge) -> tuple[F8, int]:
+        """The pose with the least residuals to these partners, and how many there are."""
+        T_now, matches = descend(
+            self.points, self.point_normal, T, scale_m**2, self.mean, self.normal, self.shape, self.error, self.weight,
+            knowledge.basis, knowledge.information, knowledge.T, INNER_STEPS, MIN_MATCHES, ROTATION_STEP_RAD,
+            TRANSLATION_STEP_M,
+        )  # fmt: skip
+        return T_now, int(matches)
+
+    def linearise(self, T: F8, scale_m: float) -> tuple[F8, F8, Sums]:
         """H (6, 6), b (6,) and the sums of the residuals; their errors and weights are kept."""
-        H, b = np.zeros((6, 6)), np.zeros(6)
-        surfaces, results = (self.mean, self.normal, self.shape), (H, b, self.error, self.weight)
-        if self.point_normal is None:
-            sums = linearise_points(self.points, T, scale_m**2, *surfaces, *results)
-        else:
-            sums = linearise_planes(self.points, self.point_normal, T, scale_m**2, *surfaces, *results)
-        return H, b, _Residuals(*sums)
+        H, b = np.empty((6, 6)), np.empty(6)
+        sums = linearise(
+            self.points, self.point_normal, T, scale_m**2, self.mean, self.normal, self.shape, H, b, self.error,
+            self.weight,
+        )  # fmt: skip
+        return H, b, Sums(*sums)
 
 
-def _step(H: F8, b: F8, basis: F8) -> F8:
-    step: F8 = basis @ np.linalg.lstsq(basis.T @ H @ basis, -basis.T @ b, rcond=1e-12)[0]
-    return step
-
-
-def _with_knowledge(H: F8, b: F8, sigma2: float, known: F8, expected: F8, T: F8) -> tuple[F8, F8]:
-    """The normal equations with what was known of the pose before, in units of the residuals' variance."""
-    if not np.isfinite(sigma2):
-        return H, b
-    prior = sigma2 * known
-    return H + prior, b + prior @ se3_log(inverse(expected) @ T)
-
-
-def _small(step: F8) -> bool:
-    return bool(
-        np.linalg.norm(step[:3]) < ROTATION_STEP_RAD and np.linalg.norm(step[3:]) < TRANSLATION_STEP_M
-    )
+@kernel
+def _moved(a: F8, b: F8) -> tuple[float, float]:
+    """Turn, rad (for small ones), and way, m, between two poses."""
+    turn2 = way2 = 0.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        w = 0.0
+        for m in range(3):
+            w += 0.5 * (a[m, k] * b[m, j] - a[m, j] * b[m, k])
+        turn2 += w * w
+        way2 += (a[i, 3] - b[i, 3]) ** 2
+    return np.sqrt(turn2), np.sqrt(way2)
 
 
 def _close(a: F8, b: F8, tolerance: float) -> bool:
-    turn = a[:3, :3].T @ b[:3, :3]
-    w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    way = np.linalg.norm(a[:3, 3] - b[:3, 3])
-    return bool(np.linalg.norm(w) < tolerance * ROTATION_STEP_RAD and way < tolerance * TRANSLATION_STEP_M)
+    turn, way = _moved(a, b)
+    return bool(turn < tolerance * ROTATION_STEP_RAD and way < tolerance * TRANSLATION_STEP_M)
 
 
 def _result(
-    T: F8, H: F8, b: F8, residual: _Residuals, partner: _Partners, converged: bool, iterations: int
+    T: F8, H: F8, b: F8, residual: Sums, partner: _Partners, converged: bool, iterations: int
 ) -> Registration:
-    matched = partner.shape > 0
-    points = partner.points
+    rmse_m = float(np.sqrt(residual.inlier_square / residual.inliers)) if residual.inliers else float("nan")
+    points, normals, residuals, weights, normal_variance = _matched(
+        T,
+        partner.points,
+        partner.normal,
+        partner.shape,
+        partner.error,
+        partner.weight,
+        partner.normal_variance,
+    )
     return Registration(
         T_target_source=T,
         information=H,
-        rmse_m=float(np.sqrt(residual.inlier_square / residual.inliers))
-        if residual.inliers
-        else float("nan"),
-        inlier_ratio=residual.inliers / max(len(points), 1),
+        rmse_m=rmse_m,
+        inlier_ratio=residual.inliers / max(len(partner.points), 1),
         converged=converged,
         iterations=iterations,
         sigma2=residual.sigma2,
         gradient=b,
-        points=points[matched],
-        normals=partner.normal[matched] @ T[:3, :3],
-        residuals=partner.error[matched],
-        weights=partner.weight[matched],
-        normal_variance=partner.normal_variance[matched],
+        points=points,
+        normals=normals,
+        residuals=residuals,
+        weights=weights,
+        normal_variance=normal_variance,
     )
+
+
+@kernel
+def _matched(
+    T: F8, points: F8, normal: F8, shape: F8, error: F8, weight: F8, normal_variance: F8
+) -> tuple[F8, F8, F8, F8, F8]:
+    """Rows with a partner: points, normals in the frame of the source, residuals, weights, variances of the normals."""
+    matches = 0
+    for n in range(len(points)):
+        matches += shape[n] > 0.0
+    p, u, e, w, v = (
+        np.empty((matches, 3)), np.empty((matches, 3)), np.empty(matches), np.empty(matches), np.empty(matches),
+    )  # fmt: skip
+    k = 0
+    for n in range(len(points)):
+        if not shape[n] > 0.0:
+            continue
+        for i in range(3):
+            p[k, i] = points[n, i]
+            u[k, i] = T[0, i] * normal[n, 0] + T[1, i] * normal[n, 1] + T[2, i] * normal[n, 2]
+        e[k], w[k], v[k] = error[n], weight[n], normal_variance[n]
+        k += 1
+    return p, u, e, w, v
 
 
 @kernel

@@ -92,7 +92,7 @@ class VoxelMap:
         )
 
     def _corners(self) -> F8:
-        return _corners(self.voxel_key[: self.voxels], self.voxel_size_m)
+        return corners(self.voxel_key[: self.voxels], self.voxel_size_m)
 
     def _reserve(self, voxels: int) -> None:
         if voxels > len(self.voxel_key):
@@ -114,7 +114,7 @@ class VoxelMap:
         self.voxels = n
         self.keys = np.full(table_length(capacity), EMPTY, np.int64)
         self.values = np.zeros(len(self.keys), np.int32)
-        _index(self.voxel_key, self.voxels, self.keys, self.values)
+        index_voxels(self.voxel_key, self.voxels, self.keys, self.values)
 
     def _blank(self, capacity: int) -> tuple[I8, I4, F4, F4, I4]:
         each = self.points_per_voxel
@@ -138,7 +138,8 @@ STEPS = neighbour_steps()
 
 
 @kernel
-def _corners(keys: I8, size: Float) -> F8:
+def corners(keys: I8, size: Float) -> F8:
+    """Corner (n, 3) of the voxel of each key, m."""
     out = np.empty((len(keys), 3))
     for n in range(len(keys)):
         i, j, k = unpack(keys[n])
@@ -147,7 +148,8 @@ def _corners(keys: I8, size: Float) -> F8:
 
 
 @kernel
-def _index(voxel_key: I8, voxels: Int, keys: I8, values: I4) -> None:
+def index_voxels(voxel_key: I8, voxels: Int, keys: I8, values: I4) -> None:
+    """Enter the first `voxels` keys into an empty hash table."""
     for v in range(voxels):
         slot = find_slot(keys, voxel_key[v])
         keys[slot] = voxel_key[v]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scanloom.stages.geometry.registration import VoxelMap
+from scanloom.stages.geometry.registration import SurfelMap
 from scanloom.stages.geometry.se3 import F8, se3_exp, se3_log
 from scanloom.stages.odometry.prediction import Prediction
 
@@ -23,7 +23,7 @@ SURE_TURN_RAD = 0.01
 class Aside:
     """A map of scans in succession, each registered to those before it. `first` is the row of the first."""
 
-    map: VoxelMap
+    map: SurfelMap
     first: int
     measured: bool
     """Whether sensors told the motion from the row before the first; `covariance` (6, 6) is that of this motion."""

@@ -34,19 +34,20 @@ class Settings(Cutting):
         1.0, ge=0.1, le=5.0, description="edge of a voxel of the local map, also the reach of the search, m"
     )
     points_per_voxel: int = Field(
-        20, ge=4, le=100, description="most points kept in a voxel of the local map"
+        20, ge=4, le=100, description="most points kept in a voxel where windows are joined"
     )
-    dense_voxel_size_m: float = Field(
-        0.7, ge=0.1, le=5.0, description="the same where scans are dense enough for surfaces of this size, m"
-    )
+    dense_voxel_size_m: float = Field(0.6, ge=0.1, le=5.0, description="the same where scans are dense, m")
     dense_source_voxel_m: float = Field(
-        1.0, ge=0.05, le=10.0, description="what dense scans are thinned to before they are registered, m"
+        0.5, ge=0.05, le=10.0, description="what dense scans are thinned to before they are registered, m"
+    )
+    dense_map_spacing_m: float = Field(
+        0.3, ge=0.02, le=5.0, description="what dense scans are thinned to before they enter the map, m"
     )
     dense_share: float = Field(
         0.145,
         ge=0.0,
         le=1.0,
-        description="scans are dense when of the first one's points this share lies on a surface of the dense voxel's size",
+        description="scans are dense when of the first one's points this share lies on a surface of 0.7 m",
     )
     map_spacing_m: float = Field(
         0.4, ge=0.02, le=5.0, description="scans are thinned to this before they enter the map, m"

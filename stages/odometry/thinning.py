@@ -16,6 +16,7 @@ from scanloom.stages.odometry.settings import Settings
 
 LEAST_TO_JUDGE, DENSE_POINTS = 500, 8000
 """Points of a thinned scan: fewer say nothing of the sensor; a sensor near walls has surfaces with fewer, too."""
+DENSE_REACH_M = 0.7
 USED = (PointClass.UNLABELLED, PointClass.GROUND, PointClass.STATIC)
 USED_CLASS = np.isin(np.arange(256), USED)
 
@@ -44,14 +45,12 @@ class Thinner:
     def thin(self, scan: DeskewedScan, labels: ScanLabels) -> ThinScan:
         """Of the points that may be part of the static world, the first in each voxel."""
         chosen = self._settings
-        fine = _first_used(
-            scan.x_m, scan.y_m, scan.z_m, labels.class_, USED_CLASS, 1.0 / chosen.map_spacing_m,
-            table_length(len(scan)),
-        )  # fmt: skip
+        fine = _fine(scan, labels, chosen.dense_map_spacing_m if self._dense else chosen.map_spacing_m)
         if self._dense is None and len(fine) >= LEAST_TO_JUDGE:
-            self._dense = len(fine) >= DENSE_POINTS and (
-                surface_share(fine, chosen.dense_voxel_size_m) >= chosen.dense_share
-            )
+            share = surface_share(fine, DENSE_REACH_M) if len(fine) >= DENSE_POINTS else 0.0
+            self._dense = len(fine) >= DENSE_POINTS and share >= chosen.dense_share
+            if self._dense:
+                return self.thin(scan, labels)
         voxel_m, source_m = chosen.voxel_size_m, chosen.source_voxel_m
         if self._dense:
             voxel_m, source_m = chosen.dense_voxel_size_m, chosen.dense_source_voxel_m
@@ -59,6 +58,13 @@ class Thinner:
         planes = chosen.residual == "plane_to_plane"
         normals = normals_at(coarse, fine, voxel_m) if planes else None
         return ThinScan(scan.scan_index, scan.reference_ns, fine, coarse, voxel_m, normals)
+
+
+def _fine(scan: DeskewedScan, labels: ScanLabels, spacing_m: float) -> F8:
+    fine: F8 = _first_used(
+        scan.x_m, scan.y_m, scan.z_m, labels.class_, USED_CLASS, 1.0 / spacing_m, table_length(len(scan))
+    )
+    return fine
 
 
 def surface_share(points: F8, voxel_m: float) -> float:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanloom.stages.geometry.degeneracy import Degeneracy, blind, judge
-from scanloom.stages.geometry.registration import Registration, VoxelMap, align
+from scanloom.stages.geometry.registration import Registration, SurfelMap, align
 from scanloom.stages.geometry.se3 import F8, inverse, se3_log, transform
 from scanloom.stages.odometry.aside import Aside, Unconfirmed, unknown_motion
 from scanloom.stages.odometry.belief import Belief
@@ -20,6 +20,7 @@ from scanloom.stages.odometry.settings import Settings
 from scanloom.stages.odometry.thinning import ThinScan
 
 MIN_POINTS = 50
+FEW_FIRST = 4
 MIN_INLIERS = 30
 MIN_INLIERS_OF_MATCHES = 0.4
 FADING = 0.9
@@ -101,14 +102,14 @@ class Tracker:
         enough = len(fine) >= MIN_POINTS
         return Row(index, stamp_ns, self.T, self.floor, 1.0 if enough else 0.0, 0.0, blind(), True, enough)
 
-    def _register(self, coarse: F8, prediction: Prediction, target: VoxelMap) -> Found:
+    def _register(self, coarse: F8, prediction: Prediction, target: SurfelMap) -> Found:
         """Align to the map from the prediction; directions the scan does not tell stay as predicted."""
         if len(coarse) < MIN_POINTS or len(target) < MIN_POINTS:
             return Found.nothing(prediction)
         attempt = self._attempt(coarse, prediction, target)
         return self._found(attempt, coarse, prediction, target)
 
-    def _found(self, attempt: Attempt, coarse: F8, prediction: Prediction, target: VoxelMap) -> Found:
+    def _found(self, attempt: Attempt, coarse: F8, prediction: Prediction, target: SurfelMap) -> Found:
         """What a registration tells. A scan that was searched for has no expected motion for what it does not see."""
         registration = attempt.registration
         seen = self._judge(registration, prediction)
@@ -138,7 +139,7 @@ class Tracker:
         """What is known of the last pose. While lost the motion counts from where the map was left (see `Rows.settle`)."""
         return Belief(self.floor) if self.rows.lost else self.belief
 
-    def _attempt(self, coarse: F8, prediction: Prediction, target: VoxelMap) -> Attempt:
+    def _attempt(self, coarse: F8, prediction: Prediction, target: SurfelMap) -> Attempt:
         """From the prediction; where that fails (slip, nothing known yet) the best from other starts, else searched for."""
         expected, n = self.T @ prediction.T_last_now, len(coarse)
         first = self._align_expected(coarse, prediction, target)
@@ -168,7 +169,9 @@ class Tracker:
             registration, point_noise_m=self.settings.point_noise_m, snr=snr, kind=self.settings.indicator
         )
 
-    def _slid(self, registration: Registration, coarse: F8, prediction: Prediction, target: VoxelMap) -> bool:
+    def _slid(
+        self, registration: Registration, coarse: F8, prediction: Prediction, target: SurfelMap
+    ) -> bool:
         """Whether a registration is not credible only because it slid along directions that the scan does not tell."""
         seen = self._judge(registration, prediction)
         if (seen.p >= self.settings.least_p).all():
@@ -179,7 +182,7 @@ class Tracker:
         return self._credible(held, n, prediction) and not self.recovery.doubts(held, n)
 
     def _credible_from(
-        self, starts: Sequence[F8], coarse: F8, prediction: Prediction, target: VoxelMap
+        self, starts: Sequence[F8], coarse: F8, prediction: Prediction, target: SurfelMap
     ) -> list[Registration]:
         tries = [self._align(coarse, start, target) for start in starts]
         return [r for r in tries if self._credible(r, len(coarse), prediction)]
@@ -216,7 +219,7 @@ class Tracker:
         return found
 
     def _align_expected(
-        self, coarse: F8, prediction: Prediction, target: VoxelMap, free: F8 | None = None
+        self, coarse: F8, prediction: Prediction, target: SurfelMap, free: F8 | None = None
     ) -> Registration:
         """From the predicted pose, which counts as far as it is known; not at all while the map is lost."""
         known = prediction.known and not self.rows.lost and self.settings.least_p > 0
@@ -224,12 +227,13 @@ class Tracker:
         return self._align(coarse, self.T @ prediction.T_last_now, target, free, held)
 
     def _align(
-        self, coarse: F8, T: F8, target: VoxelMap, free: F8 | None = None, held: F8 | None = None
+        self, coarse: F8, T: F8, target: SurfelMap, free: F8 | None = None, held: F8 | None = None
     ) -> Registration:
         scale = float(np.clip(self.deviation.rms_m, self.settings.least_scale_m, self.settings.most_scale_m))
         return align(
             target, coarse, T, max_distance_m=target.voxel_size_m, scale_m=scale,
             max_iterations=self.settings.max_iterations, free=free, held=held, source_normals=self.normals,
+            few_first=FEW_FIRST,
         )  # fmt: skip
 
     def _credible(self, registration: Registration, points: int, prediction: Prediction) -> bool:
@@ -282,7 +286,7 @@ class Tracker:
     def _confirm(self, surprise: Unconfirmed | None, in_map: bool) -> None:
         """A scan found by surprise waits for the next; one that waited enters the map when this one is registered."""
         if in_map and self.unconfirmed is not None:
-            self.map.insert(transform(self.unconfirmed.T, self.unconfirmed.fine))
+            self.map.insert(self.unconfirmed.fine, self.unconfirmed.T)
         if in_map:
             self.unconfirmed = surprise
 
@@ -308,13 +312,13 @@ class Tracker:
             self.inserted_T, self.T, self.settings.insert_m, self.settings.insert_rad
         ):  # fmt: skip
             return
-        self.map.insert(transform(self.T, scan.fine))
+        self.map.insert(scan.fine, self.T)
         self.inserted_T = self.T
         if np.linalg.norm(self.T[:3, 3] - self.dropped_m) > DROP_SHARE * self.settings.map_radius_m:
             self.map.drop_far(self.T[:3, 3], self.settings.map_radius_m)
             self.dropped_m = self.T[:3, 3]
 
-    def _start_anew(self, new: VoxelMap) -> None:
+    def _start_anew(self, new: SurfelMap) -> None:
         self.map, self.bridged, self.inlier_ratio, self.recovery.usual = new, 0, 0.0, 0.0
         self.inserted_T, self.aside, self.unconfirmed = self.T, None, None
         self.belief = Belief(self.floor)
@@ -328,8 +332,8 @@ class Tracker:
         self.keyframe_T, self.keyframe_ns = self.T, stamp_ns
         return True
 
-    def _new_map(self) -> VoxelMap:
-        return VoxelMap(self.voxel_size_m, self.settings.points_per_voxel)
+    def _new_map(self) -> SurfelMap:
+        return SurfelMap(self.voxel_size_m)
 
 
 @dataclass(frozen=True)
