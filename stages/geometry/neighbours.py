@@ -16,14 +16,13 @@ from scanloom.schemas.scans import Scan
 from scanloom.stages.geometry.compensation import compensate
 from scanloom.stages.geometry.degeneracy import translation_information
 from scanloom.stages.geometry.motion import MotionTrack
-from scanloom.stages.geometry.registration import Registration, VoxelMap, align
+from scanloom.stages.geometry.registration import Registration, SurfelMap, align
 from scanloom.stages.geometry.se3 import F8, se3_log
 from scanloom.stages.geometry.voxels import downsample
 
 DENSE_POINTS = 8000
 FINE_VOXEL_M, COARSE_VOXEL_M = 1.0, 2.0
 """Scans with fewer points than `DENSE_POINTS` after thinning need wider surfaces: their beams are far apart."""
-POINTS_PER_VOXEL = 20
 TARGET_SPACING_M = 0.3
 SOURCE_SPACING_M = 1.0
 TARGET_POINTS = 40_000
@@ -133,7 +132,7 @@ def _register(
     a: ThinScan, b: ThinScan, track: MotionTrack, twist: F8, scale_m: float, iterations: int
 ) -> Registration:
     voxel_m = FINE_VOXEL_M if len(a.dense.x_m) > DENSE_POINTS else COARSE_VOXEL_M
-    target = VoxelMap(voxel_m, POINTS_PER_VOXEL)
+    target = SurfelMap(voxel_m)
     target.insert(_compensated(a.dense, a.reference_ns, track, twist))
     return align(
         target, _compensated(b.sparse, b.reference_ns, track, twist), track.relative(a.reference_ns, b.reference_ns, twist),
