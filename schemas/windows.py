@@ -45,7 +45,7 @@ class Track(Odometry):
 class TrackEnds(Table):
     """What a window saw at its ends, by which it is laid onto its neighbours.
 
-    At the end: the points of the local map, in the frame of the last scan. At the begin: some scans of the overlap,
+    At the end: what the local map kept, in the frame of the last scan. At the begin: some scans of the overlap,
     thinned, in the frame of the overlap's last scan.
     """
 
