@@ -302,7 +302,9 @@ class Files(Product):
 
     def path(self, name: str) -> Path:
         if self.root is None or name not in self.names:
-            raise ProductError(f"{self.NAME} holds no file {name}")
+            raise ProductError(
+                f"{self.NAME} holds no file {name}", next_step="run the stage that writes it again"
+            )
         return self.root / name
 
     def read(self, name: str) -> bytes:
