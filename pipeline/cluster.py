@@ -194,6 +194,8 @@ def _local(workers: int | None, modules: Sequence[str]) -> tuple[Any, Any]:
             "distributed.scheduler.work-stealing": False,
             "distributed.scheduler.worker-saturation": 1.0,
             "distributed.worker.multiprocessing-method": "forkserver",
+            "distributed.worker.profile.enabled": False,  # it looks at every stack a hundred times a second
+            "distributed.admin.system-monitor.interval": "10s",
             "distributed.nanny.preload": [],
             "distributed.nanny.environ": THREADS,
             "distributed.nanny.pre-spawn-environ": {},
