@@ -211,7 +211,6 @@ def test_kitti_path_length(shared_data: Path) -> None:
     scans = []
     for k, file in enumerate(files):
         xyzr = np.fromfile(file, np.float32).reshape(-1, 4)
-        n = len(xyzr)
         stamp = k * 103_500_000
         scans.append(
             DeskewedScan(
