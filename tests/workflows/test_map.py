@@ -87,7 +87,7 @@ def test_tile_size_reruns_tiling_and_what_follows(mapped: Path) -> None:
     verdicts = {task["node"]: task["verdict"] for task in plan}
     assert verdicts.pop("tiling") == "RUN"
     assert "tile_size_m" in next(task["reason"] for task in plan if task["node"] == "tiling")
-    after = {"tiles", "overview", "evaluation", "report"}
+    after = {"tiles", "overview", "picture", "evaluation", "report"}
     assert {node for node, verdict in verdicts.items() if verdict != "HIT"} == after
 
 
