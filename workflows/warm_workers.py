@@ -6,7 +6,6 @@ compiled kernels, and libraries that only late stages use.
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import os
 import sys
@@ -45,7 +44,7 @@ LOWEST_PRIORITY = 19
 
 def load_while_idle() -> None:
     """Between tasks, one thing at a time: a task that begins waits for one of them at most. Other workers go first."""
-    with contextlib.suppress(AttributeError, OSError):  # threads have a priority of their own on Linux only
+    if sys.platform == "linux":  # nowhere else have threads a priority of their own
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOWEST_PRIORITY)
     for _ in _kernels:
         _wait()
