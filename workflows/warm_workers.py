@@ -20,6 +20,7 @@ from scanloom.stages.geometry.kernels import load_kernels
 LATER = ("scipy.special", "gtsam", "scipy.spatial", "scipy.ndimage", "pyproj")
 """What fusion, evaluation and report import inside their functions, in the order they are used."""
 PAUSE_S = 0.02
+LOWEST_PRIORITY = 19
 
 
 def _first_kernel(kernels: Iterator[None]) -> None:
@@ -37,9 +38,6 @@ def _first_kernel(kernels: Iterator[None]) -> None:
 
 
 _kernels = load_kernels()
-
-
-LOWEST_PRIORITY = 19
 
 
 def load_while_idle() -> None:
