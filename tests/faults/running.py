@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ def slow(folder: Path, pause_s: float) -> Any:
 
 
 def main(folder: Path, cluster: str, pause_s: float) -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background ignores it
     request = slow(folder, pause_s)
     sys.stdout.write("ready\n")
     sys.stdout.flush()
