@@ -70,7 +70,7 @@ print(before, scipy.linalg.norm([3.0, 4.0]))
 
 def test_modules_are_compiled_also_where_python_is_told_not_to(tmp_path, monkeypatch):
     (tmp_path / "thing.py").write_text("A = 1\n")
-    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     monkeypatch.setattr(warming, "import_module", lambda name: SimpleNamespace(__path__=[str(tmp_path)]))
     warming.compile_modules()
     assert len(list(tmp_path.glob("__pycache__/thing.*.pyc"))) == 1
