@@ -41,11 +41,33 @@ class Loops(Table):
     covariance: NDArray[np.float64] = column(
         "f8", "of T_i_j, order (rotation, translation), right tangent", shape=(6, 6)
     )
+    source: NDArray[np.object_] = column(
+        "str",
+        "what proposed it: `position`; `temporal`, alike with the places before and after; `segments`, alike in what is left "
+        "of the scans without ground and leaves",
+    )
     descriptor_distance: NDArray[np.float64] = column(
         "f8", "scan context distance, 0 same to 1 different; NaN for candidates by position"
+    )
+    temporal_distance: NDArray[np.float64] = column(
+        "f8", "mean scan context distance of the places before and after; NaN for candidates by position"
+    )
+    segment_distance: NDArray[np.float64] = column(
+        "f8", "segment scan context distance; NaN where it was not asked"
     )
     inlier_ratio: NDArray[np.float64] = column("f8", "share of points of submap j with a partner in submap i")
     rmse_m: NDArray[np.float64] = column("f8", "root mean square residual of the inliers", unit="m")
     overlap: NDArray[np.float64] = column("f8", "share of voxels of submap j that submap i also fills")
-    accepted: NDArray[np.bool_] = column("?", "the loop enters the pose graph")
+    seen_through: NDArray[np.float64] = column(
+        "f8", "share of tall structure of one pass that the other looked through: free-space conflict"
+    )
+    e1_m: NDArray[np.float64] = column(
+        "f8", "E1 of the registration: residual-scaled worst standard deviation of translation", unit="m"
+    )
+    rival: NDArray[np.float64] = column(
+        "f8", "fit of the second-best pose over that of the best; 0 when there is none"
+    )
+    accepted: NDArray[np.bool_] = column(
+        "?", "passed the geometric tests and enters the pose graph, which may still doubt it"
+    )
     reason: NDArray[np.object_] = column("str", "why it was accepted or rejected, in words")

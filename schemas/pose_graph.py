@@ -17,7 +17,10 @@ class Graph(Table):
 
     NAME: ClassVar[str] = "graph"
 
-    kind: NDArray[np.object_] = column("str", "`odometry`, `loop`, `gnss`, `gravity` or `prior`")
+    kind: NDArray[np.object_] = column(
+        "str",
+        "`odometry`, `wheel`, `loop`, `gnss`, `gravity`, `base` (a pose of the map that is extended) or `prior`",
+    )
     key_i: NDArray[np.object_] = column("str", "first pose")
     key_j: NDArray[np.object_] = column("str", "second pose; empty for a factor on one pose")
     measurement: NDArray[np.float64] = column(

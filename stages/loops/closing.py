@@ -99,10 +99,18 @@ def _table(
         scan_j=np.array([tracks[c.b].scan_index[c.j] for c in found], np.int64),
         T_i_j=np.array([v.T_i_j for v in verdicts], float).reshape(-1, 4, 4),
         covariance=np.array([v.covariance for v in verdicts], float).reshape(-1, 6, 6),
+        source=np.array(
+            ["temporal" if np.isfinite(c.descriptor_distance) else "position" for c in found], object
+        ),
         descriptor_distance=np.array([c.descriptor_distance for c in found], float),
+        temporal_distance=np.full(len(found), np.nan),
+        segment_distance=np.full(len(found), np.nan),
         inlier_ratio=np.array([v.inlier_ratio for v in verdicts], float),
         rmse_m=np.array([v.rmse_m for v in verdicts], float),
         overlap=np.array([v.overlap for v in verdicts], float),
+        seen_through=np.full(len(found), np.nan),
+        e1_m=np.full(len(found), np.nan),
+        rival=np.full(len(found), np.nan),
         accepted=np.array([not r for r in reasons], np.bool_),
         reason=np.array([r or "passed every test" for r in reasons], object),
     )

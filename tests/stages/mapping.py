@@ -72,6 +72,8 @@ def loops_of(T: F8, pairs: Sequence[tuple[int, int]], errors_m: Sequence[float],
     return Loops(
         session_i=names, scan_i=i, session_j=names, scan_j=j, T_i_j=T_i_j, covariance=np.tile(np.eye(6), (n, 1, 1)),
         descriptor_distance=np.full(n, 0.1), inlier_ratio=np.full(n, 0.9), rmse_m=np.full(n, 0.05), overlap=np.full(n, 0.8),
+        source=np.full(n, "position", object), temporal_distance=np.full(n, np.nan), segment_distance=np.full(n, np.nan),
+        seen_through=np.zeros(n), e1_m=np.zeros(n), rival=np.zeros(n),
         accepted=np.ones(n, bool), reason=np.array(["verified"] * n, object),
     )  # fmt: skip
 

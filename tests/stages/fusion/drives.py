@@ -143,7 +143,9 @@ def loops_of(entries: list[tuple[str, int, str, int, np.ndarray]], sigma_m: floa
         session_j=np.array([e[2] for e in entries], object), scan_j=np.array([e[3] for e in entries], np.int64),
         T_i_j=np.array([e[4] for e in entries], float).reshape(-1, 4, 4),
         covariance=np.broadcast_to(covariance, (n, 6, 6)).copy(), descriptor_distance=np.zeros(n),
-        inlier_ratio=np.ones(n), rmse_m=np.zeros(n), overlap=np.ones(n), accepted=np.ones(n, bool),
+        inlier_ratio=np.ones(n), rmse_m=np.zeros(n), overlap=np.ones(n),
+        source=np.full(n, "position", object), temporal_distance=np.full(n, np.nan), segment_distance=np.full(n, np.nan),
+        seen_through=np.zeros(n), e1_m=np.zeros(n), rival=np.zeros(n), accepted=np.ones(n, bool),
         reason=np.full(n, "", object),
     )  # fmt: skip
 

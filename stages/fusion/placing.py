@@ -1,0 +1,75 @@
+"""Which frame the map has, and where GNSS puts each session in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from scanloom.schemas.frames import Georeference
+from scanloom.schemas.tracks import Gnss
+from scanloom.stages.fusion.drives import Drive
+from scanloom.stages.fusion.gnss import Fixes, judge, screen
+from scanloom.stages.fusion.gravity import Gravity, level
+from scanloom.stages.fusion.settings import Settings
+from scanloom.stages.geometry.geodesy import georeference
+from scanloom.stages.geometry.se3 import F8, pose
+
+
+def place_by_gnss(
+    settings: Settings, drives: Sequence[Drive], ups: Sequence[Gravity]
+) -> tuple[Georeference | None, list[Fixes]]:
+    """Fixes of all sessions in the frame `world` of the first session whose GNSS tells its place; else None."""
+    verdicts = [screen(settings.gnss, d) for d in drives]
+    levels = [level(d, up) for d, up in zip(drives, ups, strict=True)]
+    origin: Georeference | None = None
+    for d, verdict, R in zip(drives, verdicts, levels, strict=True):
+        trial = _judged_at_first_fix(settings, d, verdict, R)
+        if trial is not None:
+            origin = trial
+            break
+    judged = []
+    for d, verdict, R in zip(drives, verdicts, levels, strict=True):
+        at = origin or _first_position(d) or Georeference(
+            epsg=0, latitude_deg=0, longitude_deg=0, height_m=0, easting_m=0, northing_m=0, grid_convergence_rad=0,
+            point_scale=1,
+        )  # fmt: skip
+        judged.append(judge(settings.gnss, d, verdict, at, R))
+    return origin, judged
+
+
+def _judged_at_first_fix(settings: Settings, d: Drive, verdict: np.ndarray, R: F8) -> Georeference | None:
+    """Georeference at the first fix that enters the graph, when GNSS tells the session's place."""
+    passed = np.flatnonzero(verdict == "")
+    if not len(passed):
+        return None
+    provisional = _georeference(d.gnss, int(passed[0]))
+    fixes = judge(settings.gnss, d, verdict, provisional, R)
+    used = np.flatnonzero(fixes.verdict == "")
+    if fixes.alignment is None or not len(used):
+        return None
+    return _georeference(d.gnss, int(used[0]))
+
+
+def _first_position(d: Drive) -> Georeference | None:
+    finite = (
+        np.isfinite(d.gnss.latitude_deg) & np.isfinite(d.gnss.longitude_deg) & np.isfinite(d.gnss.height_m)
+    )
+    return _georeference(d.gnss, int(np.argmax(finite))) if finite.any() else None
+
+
+def _georeference(gnss: Gnss, row: int) -> Georeference:
+    return georeference(
+        float(gnss.latitude_deg[row]), float(gnss.longitude_deg[row]), float(gnss.height_m[row])
+    )
+
+
+def placed(drives: Sequence[Drive], ups: Sequence[Gravity], fixes: Sequence[Fixes]) -> dict[int, F8]:
+    """T_map_odom of the sessions GNSS places; without any, the first session defines the frame `map`."""
+    out = {}
+    for k, (d, up, f) in enumerate(zip(drives, ups, fixes, strict=True)):
+        if f.alignment is not None:
+            out[k] = f.alignment.T_world_level @ pose(level(d, up), np.zeros(3))
+    if not out:
+        out[0] = pose(level(drives[0], ups[0]), np.zeros(3))
+    return out

@@ -1,0 +1,48 @@
+"""Settings of the fusion stage."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from scanloom.stages.fusion.gnss import GnssSettings
+
+
+class Settings(BaseModel):
+    """How far each kind of measurement is trusted."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    odometry_rotation_deg_sqrt_m: float = Field(
+        default=0.05,
+        gt=0,
+        le=10,
+        description="random walk of odometry's rotation added per root of distance, deg/sqrt(m)",
+    )
+    odometry_translation_m_sqrt_m: float = Field(
+        default=0.02,
+        gt=0,
+        le=10,
+        description="random walk of odometry's translation added per root of distance, m/sqrt(m)",
+    )
+    gravity_sigma_deg: float = Field(
+        default=1.5, gt=0, le=45, description="standard deviation of a measured up direction, deg"
+    )
+    assumed_level_sigma_deg: float = Field(
+        default=4.0,
+        gt=0,
+        le=45,
+        description="standard deviation of `the vehicle stands level` when there is no IMU, deg",
+    )
+    gravity_spacing_m: float = Field(
+        default=10.0, gt=0, le=1000, description="one gravity factor per this much path, m"
+    )
+    loop_inflation: float = Field(
+        default=1.0, ge=0.1, le=100, description="factor on the standard deviations of loops"
+    )
+    inlier_probability: float = Field(
+        default=0.999,
+        gt=0.5,
+        lt=1,
+        description="chi-square probability up to which a loop or fix is an inlier",
+    )
+    gnss: GnssSettings = Field(default_factory=GnssSettings, description="gates and weights of GNSS")
