@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanloom.schemas.product import Table, column
+from scanloom.schemas.product import Table, attribute, column
 
 
 @dataclass(frozen=True)
@@ -36,3 +37,6 @@ class Graph(Table):
     residual_after: NDArray[np.float64] = column("f8", "whitened norm at the solution")
     weight: NDArray[np.float64] = column("f8", "final robust weight, 0 switched off to 1 trusted")
     verdict: NDArray[np.object_] = column("str", "`used`, or why it was left out")
+    remarks: Sequence[str] = attribute(
+        "what a user should know of the map's making, in sentences", default=()
+    )

@@ -45,7 +45,7 @@ NODES: tuple[Node, ...] = (
     node("odometry",   odometry,   per="session", reads=(Deskewed, Labels, Session, Imu, Wheel, SensorCheck, Track, TrackEnds), writes=Odometry),
     node("places",     places,     per="session", reads=(Deskewed, Labels, Odometry),          writes=Places),
     node("loops",      loops,      per="map",     reads=(Deskewed, Labels, Odometry, Places),  writes=Loops),
-    node("fusion",     fusion,     per="map",     reads=(Session, Odometry, Loops, Gnss, Imu, SensorCheck), writes=(Poses, Graph)),
+    node("fusion",     fusion,     per="map",     reads=(Session, Odometry, Loops, Gnss, Imu, Wheel, SensorCheck), writes=(Poses, Graph)),
     node("tiling",     tiling,     per="chunk",   reads=(Deskewed, Labels, Poses),             writes=Piece),
     node("tiles",      tiles,      per="tile",    reads=(Piece,),                              writes=(Tile, TileFiles)),
     node("overview",   overview,   per="map",     reads=(Tile,),                               writes=(TileIndex, MapFiles)),

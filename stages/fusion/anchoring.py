@@ -1,61 +1,27 @@
-"""Where each session starts in the map's frame: by its own GNSS, or by loops to a session that has a place."""
+"""Where each drive starts in the map's frame: by its own GNSS, by loops to one that has a place, or by the segment before."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from scanloom.schemas.errors import StageError
-from scanloom.schemas.loops import Loops
+from scanloom.stages.fusion.bridging import Bridge
 from scanloom.stages.fusion.drives import Drive
+from scanloom.stages.fusion.links import Link
 from scanloom.stages.geometry.se3 import F8, inverse, se3_log
 
 SAME_PLACE_M = 3.0
 SAME_HEADING_RAD = np.radians(10.0)
 
 
-@dataclass(frozen=True)
-class Link:
-    """An accepted loop: keyframe i of one drive sees keyframe j of another (or the same) again."""
+def anchor(
+    drives: Sequence[Drive], placed: Mapping[int, F8], found: Sequence[Link], gaps: Sequence[Bridge]
+) -> dict[int, F8]:
+    """Pose (4, 4) of every drive's frame `odom` in the map, spreading from the `placed` ones along loops.
 
-    drive_i: int
-    keyframe_i: int
-    drive_j: int
-    keyframe_j: int
-    T_i_j: F8
-    covariance: F8
-
-
-def links(drives: Sequence[Drive], loops: Loops) -> list[Link]:
-    """Accepted loops between sessions of this map.
-
-    Raises
-    ------
-    StageError : a loop names a session or scan that is not there.
-    """
-    number = {d.name: k for k, d in enumerate(drives)}
-    found = []
-    for row in np.flatnonzero(loops.accepted):
-        ends = []
-        for name, scan in (
-            (loops.session_i[row], loops.scan_i[row]),
-            (loops.session_j[row], loops.scan_j[row]),
-        ):
-            if name not in number:
-                raise StageError(
-                    f"a loop names session {name}, which is not part of this map",
-                    next_step="run the loops stage again for these sessions",
-                )
-            ends.append((number[name], drives[number[name]].keyframe_of_scan(int(scan))))
-        (a, i), (b, j) = ends
-        found.append(Link(a, i, b, j, loops.T_i_j[row], loops.covariance[row]))
-    return found
-
-
-def anchor(drives: Sequence[Drive], placed: Mapping[int, F8], found: Sequence[Link]) -> dict[int, F8]:
-    """Pose (4, 4) of every session's frame `odom` in the map, spreading from the `placed` ones along loops.
+    A segment that no loop reaches follows the one before it or after it by the bridge between them.
 
     Raises
     ------
@@ -63,17 +29,32 @@ def anchor(drives: Sequence[Drive], placed: Mapping[int, F8], found: Sequence[Li
     """
     start = dict(placed)
     while len(start) < len(drives):
-        reached = {d for d in range(len(drives)) if d not in start and _proposals(drives, start, found, d)}
+        waiting = [d for d in range(len(drives)) if d not in start]
+        by_loops = {d: p for d in waiting if (p := _proposals(drives, start, found, d))}
+        by_bridges = {d: p for d in waiting if (p := _beyond(drives, start, gaps, d))}
+        reached = by_loops or by_bridges
         if not reached:
-            lost = next(d for d in range(len(drives)) if d not in start)
             raise StageError(
                 "nothing ties this session to the others: it has no usable GNSS and no loop to them was accepted",
-                where=f"session {drives[lost].name}",
+                where=f"session {drives[waiting[0]].name}",
                 next_step="map it on its own, or add a session that overlaps both",
             )
         d = min(reached)
-        start[d] = _most_supported(_proposals(drives, start, found, d))
+        start[d] = _most_supported(reached[d])
     return start
+
+
+def _beyond(drives: Sequence[Drive], start: Mapping[int, F8], gaps: Sequence[Bridge], d: int) -> list[F8]:
+    """What the bridges to segments that have a place say about T_map_odom of drive `d`."""
+    out = []
+    for gap in gaps:
+        a, b = gap.drive_i, gap.drive_i + 1
+        T_a, T_b = _odom_pose(drives[a], -1), _odom_pose(drives[b], 0)
+        if b == d and a in start:
+            out.append(start[a] @ T_a @ gap.T_i_j @ inverse(T_b))
+        elif a == d and b in start:
+            out.append(start[b] @ T_b @ inverse(gap.T_i_j) @ inverse(T_a))
+    return out
 
 
 def _proposals(drives: Sequence[Drive], start: Mapping[int, F8], found: Sequence[Link], d: int) -> list[F8]:

@@ -2,29 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from scanloom.stages.fusion.anchoring import Link
-from scanloom.stages.fusion.drives import Drive
+from scanloom.stages.fusion.bridging import Bridge
+from scanloom.stages.fusion.drives import I8, Drive
 from scanloom.stages.fusion.factors import Factor
 from scanloom.stages.fusion.gnss import Fixes
 from scanloom.stages.fusion.gravity import Gravity
+from scanloom.stages.fusion.links import Link
 from scanloom.stages.fusion.settings import Settings
+from scanloom.stages.fusion.wheel import NO_MOTIONS, Odometer
 from scanloom.stages.geometry.se3 import F8, inverse, pose
+
+UNSEEN_STD_M = 10.0
+"""Of odometry along directions that no scan saw (methods 1.8): there the wheels decide, and GNSS."""
 
 
 def assembled(
     settings: Settings, drives: Sequence[Drive], ups: Sequence[Gravity], fixes: Sequence[Fixes],
-    found: Sequence[Link], nodes: F8,
+    found: Sequence[Link], gaps: Sequence[Bridge], odometers: Mapping[str, Odometer], nodes: F8,
 ) -> list[Factor]:  # fmt: skip
+    """Every factor of the map, used or not, session by session."""
     georeferenced = any(f.alignment is not None for f in fixes)
     factors = [_gauge(nodes, georeferenced)]
     for d, up, f in zip(drives, ups, fixes, strict=True):
-        factors += _odometry_factors(settings, d)
+        factors += _motion_factors(settings, d, odometers.get(d.name))
         factors += _gravity_factors(settings, d, up)
         factors += _gnss_factors(d, f)
+    factors += [_bridge_factor(bridge) for bridge in gaps]
     return factors + _loop_factors(settings, drives, found)
 
 
@@ -37,14 +44,50 @@ def _gauge(nodes: F8, georeferenced: bool) -> Factor:
     return Factor("prior", 0, -1, nodes[0], covariance)
 
 
-def _odometry_factors(settings: Settings, d: Drive) -> list[Factor]:
-    motion, covariance = d.keyframe_motions(
-        float(np.radians(settings.odometry_rotation_deg_sqrt_m)), settings.odometry_translation_m_sqrt_m
-    )
+def _motion_factors(settings: Settings, d: Drive, odometer: Odometer | None) -> list[Factor]:
+    """Odometry between neighbouring keyframes, and the wheels beside it where there are any."""
+    wheels = odometer.keyframe_motions(d) if odometer is not None else NO_MOTIONS
+    walk = float(np.radians(settings.odometry_rotation_deg_sqrt_m)), settings.odometry_translation_m_sqrt_m
+    motion, covariance = d.keyframe_motions(*walk, _step_covariance(settings, d, wheels.first))
     return [
         Factor("odometry", int(a), int(a) + 1, T, C)
         for a, T, C in zip(d.nodes[:-1], motion, covariance, strict=True)
+    ] + [
+        Factor("wheel", int(a), int(a) + 1, T, C)
+        for a, T, C in zip(d.nodes[wheels.first], wheels.T, wheels.covariance, strict=True)
     ]
+
+
+def _step_covariance(settings: Settings, d: Drive, by_wheels: I8) -> F8:
+    """Covariances (n, 6, 6) of odometry's steps; what scans did not see counts for nothing where wheels tell it."""
+    if settings.covariance == "fixed":
+        return np.zeros((len(d.odometry), 6, 6))
+    covariance = d.step_covariance().copy()
+    last = np.searchsorted(d.keyframes, np.arange(len(d.odometry)))
+    told = np.isin(last - 1, by_wheels)
+    covariance[told, 3:, 3:] += UNSEEN_STD_M**2 * d.unseen_translation()[told]
+    return covariance
+
+
+def odometers_of(settings: Settings, drives: Sequence[Drive]) -> dict[str, Odometer]:
+    """Gyro and wheels of each session that has them, by its name."""
+    if settings.covariance == "fixed":
+        return {}
+    found: dict[str, list[Drive]] = {}
+    for d in drives:
+        if len(d.wheel):
+            found.setdefault(d.name, []).append(d)
+    return {name: Odometer(settings.wheel, parts) for name, parts in found.items()}
+
+
+def _bridge_factor(bridge: Bridge) -> Factor:
+    return Factor(
+        "wheel" if bridge.measured else "odometry",
+        bridge.node_i,
+        bridge.node_j,
+        bridge.T_i_j,
+        bridge.covariance,
+    )
 
 
 def _gravity_factors(settings: Settings, d: Drive, up: Gravity) -> list[Factor]:

@@ -1,4 +1,8 @@
-"""One session's inputs to the fusion, with what is asked of them again and again."""
+"""One session's inputs to the fusion, with what is asked of them again and again.
+
+Where odometry lost the motion a new drive begins: nothing but loops, GNSS and the vehicle's own sensors tells where it
+stands to the one before, so that each is placed like a session of its own.
+"""
 
 from __future__ import annotations
 
@@ -21,22 +25,40 @@ from scanloom.stages.geometry.se3 import F8, adjoint, inverse
 
 I8 = NDArray[np.int64]
 
+SEEN_P = 0.5
+"""Directions observed beyond noise with a smaller probability were not seen."""
+
 UNKNOWN_STEP_SIGMA = (np.radians(5.0), 1.0)
 """Rotation rad, translation m assumed for a step whose covariance odometry does not know."""
 
 
 @dataclass(frozen=True)
 class Drive:
-    """A session on its way through the fusion; `first_node` numbers its first keyframe among all sessions'."""
+    """A segment of a session on its way through the fusion; `first_node` numbers its first keyframe among all drives'.
+
+    Odometry and GNSS are those of the segment; IMU and wheels, on the LiDAR's clock, those of the whole session.
+    """
 
     name: str
+    """Of the session."""
     session: Session
     odometry: Odometry
     gnss: Gnss
     imu: Imu
+    wheel: Wheel
     first_node: int
     keyframes: I8
     """Rows of `odometry` that are nodes of the graph."""
+
+    @property
+    def segment(self) -> int:
+        """Number of the segment in its session."""
+        return int(self.odometry.segment[0])
+
+    @property
+    def title(self) -> str:
+        """How messages call it."""
+        return self.name if self.segment == 0 else f"{self.name}, segment {self.segment}"
 
     @property
     def nodes(self) -> I8:
@@ -99,11 +121,13 @@ class Drive:
             )
         return at
 
-    def keyframe_motions(self, rotation_rad_sqrt_m: float, translation_m_sqrt_m: float) -> tuple[F8, F8]:
+    def keyframe_motions(
+        self, rotation_rad_sqrt_m: float, translation_m_sqrt_m: float, step_covariance: F8
+    ) -> tuple[F8, F8]:
         """Motions (k-1, 4, 4) between neighbouring keyframes and their covariances (k-1, 6, 6).
 
-        Covariances of the single steps are carried to the end of the motion, C = sum Ad(T_b^-1 T_k) C_k Ad^T, and a
-        random walk in the distance driven is added: steps share errors that their own covariances do not tell.
+        Covariances of the single steps (n, 6, 6) are carried to the end of the motion, C = sum Ad(T_b^-1 T_k) C_k Ad^T,
+        and a random walk in the distance driven is added: steps share errors that their own covariances do not tell.
         """
         T, rows = self.odometry.T_odom_lidar, self.keyframes
         motion = inverse(T[rows[:-1]]) @ T[rows[1:]]
@@ -112,7 +136,7 @@ class Drive:
             return motion, np.zeros((0, 6, 6))
         end = rows[np.searchsorted(rows, steps)]
         A = adjoint(inverse(T[end]) @ T[steps])
-        carried = A @ _trusted(self.odometry.covariance[steps]) @ np.swapaxes(A, 1, 2)
+        carried = A @ step_covariance[steps] @ np.swapaxes(A, 1, 2)
         covariance = np.add.reduceat(carried, rows[:-1] - rows[0], axis=0)
         path = np.diff(self.travelled_m[rows])
         walk = np.repeat([rotation_rad_sqrt_m**2, translation_m_sqrt_m**2], 3)
@@ -120,8 +144,18 @@ class Drive:
         covariance = covariance + (path[:, None] * walk + still)[:, :, None] * np.eye(6)
         return motion, 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
 
+    def step_covariance(self) -> F8:
+        """Covariances (n, 6, 6) of the motion to each scan as odometry states them; a wide guess where it does not."""
+        return trusted(self.odometry.covariance)
 
-def _trusted(covariance: F8) -> F8:
+    def unseen_translation(self) -> F8:
+        """(n, 3, 3): sum of u u^T over the directions u of translation that a scan did not see, in the LiDAR frame."""
+        weak = self.odometry.direction_p < SEEN_P
+        u = self.odometry.weak_directions[:, 3:, :] * weak[:, None, :]
+        return np.asarray(u @ np.swapaxes(u, 1, 2))
+
+
+def trusted(covariance: F8) -> F8:
     """Covariances with the unknown ones (not finite, or negative on the diagonal) replaced by a wide guess."""
     diagonal = np.diagonal(covariance, axis1=1, axis2=2)
     good = np.asarray(np.isfinite(covariance).all(axis=(1, 2)) & (diagonal >= 0).all(axis=1))
@@ -134,18 +168,19 @@ def gather(
     odometry: Parts[Odometry],
     gnss: Parts[Gnss],
     imu: Parts[Imu],
+    wheel: Parts[Wheel] | None = None,
     check: Parts[SensorCheck] | None = None,
 ) -> Iterator[Drive]:
-    """The sessions of a map in order of their names; the IMU is corrected as `check` says.
+    """The sessions of a map in order of their names, segment by segment; IMU and wheels are corrected as `check` says.
 
     Raises
     ------
     StageError : a session has no odometry.
     """
     tracks, fixes, inertial = _by_session(odometry), _by_session(gnss), _by_session(imu)
-    checks = _by_session(check) if check is not None else {}
+    turning, checks = _by_session(wheel), _by_session(check)
     first_node = 0
-    for name, document in _by_session(session).items():
+    for name, document in sorted(_by_session(session).items()):
         track = tracks.get(name)
         if track is None or len(track) == 0:
             raise StageError(
@@ -153,21 +188,29 @@ def gather(
                 where=f"session {name}",
                 next_step="look why odometry gave no scan a pose",
             )
-        inertia, _ = corrected(inertial.get(name, Imu.empty()), Wheel.empty(), checks.get(name))
-        keyframes = np.flatnonzero(track.keyframe).astype(np.int64)
-        if not len(keyframes):
-            keyframes = np.unique([0, len(track) - 1]).astype(np.int64)
-        yield Drive(
-            name,
-            document,
-            track,
-            fixes.get(name, Gnss.empty()),
-            inertia,
-            first_node,
-            keyframes,
+        sensors = corrected(
+            inertial.get(name, Imu.empty()), turning.get(name, Wheel.empty()), checks.get(name)
         )
-        first_node += len(keyframes)
+        for part, own in _segments(track, fixes.get(name, Gnss.empty())):
+            keyframes = np.flatnonzero(part.keyframe).astype(np.int64)
+            if not len(keyframes):
+                keyframes = np.unique([0, len(part) - 1]).astype(np.int64)
+            yield Drive(name, document, part, own, *sensors, first_node, keyframes)
+            first_node += len(keyframes)
 
 
-def _by_session(parts: Parts[ProductT]) -> dict[str, ProductT]:
+def _segments(track: Odometry, gnss: Gnss) -> Iterator[tuple[Odometry, Gnss]]:
+    """Odometry of each segment with the fixes from its first scan to that of the next one."""
+    first = np.unique(track.segment, return_index=True)[1]
+    if len(first) == 1:
+        yield track, gnss
+        return
+    number = np.searchsorted(track.stamp_ns[first], gnss.stamp_ns, side="right") - 1
+    for k, rows in enumerate(np.split(np.arange(len(track)), np.sort(first)[1:])):
+        yield track.take(rows), gnss.take(np.flatnonzero(np.maximum(number, 0) == k))
+
+
+def _by_session(parts: Parts[ProductT] | None) -> dict[str, ProductT]:
+    if parts is None:
+        return {}
     return {where.get("session", ""): part for where, part in parts.items()}

@@ -5,7 +5,9 @@ Batch pose graph over keyframes (methods 1.8 to 1.10). Every factor, used or not
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
 
 import numpy as np
 
@@ -15,13 +17,15 @@ from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.product import Part, Parts
 from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.session import Session
-from scanloom.schemas.tracks import Gnss, Imu
+from scanloom.schemas.tracks import Gnss, Imu, Wheel
 from scanloom.schemas.trajectory import Odometry, Poses
-from scanloom.stages.fusion.anchoring import anchor, links
-from scanloom.stages.fusion.assembly import assembled
+from scanloom.stages.fusion.anchoring import anchor
+from scanloom.stages.fusion.assembly import assembled, odometers_of
+from scanloom.stages.fusion.bridging import bridges, guessed
 from scanloom.stages.fusion.drives import Drive, gather
 from scanloom.stages.fusion.factors import graph_table, whitened_norms
 from scanloom.stages.fusion.gravity import gravity
+from scanloom.stages.fusion.links import links
 from scanloom.stages.fusion.placing import place_by_gnss, placed
 from scanloom.stages.fusion.settings import Settings
 from scanloom.stages.fusion.solving import marginals, solve
@@ -39,6 +43,7 @@ def fusion(
     loops: Loops,
     gnss: Parts[Gnss],
     imu: Parts[Imu],
+    wheel: Parts[Wheel] | None = None,
     check: Parts[SensorCheck] | None = None,
 ) -> Iterator[Part[Poses] | Graph]:
     """Optimised poses of every scan, one part per session, then the graph.
@@ -50,21 +55,25 @@ def fusion(
     ------
     StageError : a session has no odometry, or nothing ties it to the others.
     """
-    drives = list(gather(session, odometry, gnss, imu, check))
+    drives = list(gather(session, odometry, gnss, imu, wheel, check))
     if not drives:
         raise StageError("there is no session to fuse", next_step="add a session to the map")
     ups = [gravity(d, settings.gravity_spacing_m) for d in drives]
+    odometers = odometers_of(settings, drives)
+    gaps = bridges(drives, odometers)
     origin, fixes = place_by_gnss(settings, drives, ups)
     found = links(drives, loops)
-    starts = anchor(drives, placed(drives, ups, fixes), found)
+    starts = anchor(drives, placed(drives, ups, fixes), found, gaps)
     nodes = np.concatenate([starts[k] @ d.odometry.T_odom_lidar[d.keyframes] for k, d in enumerate(drives)])
-    factors = assembled(settings, drives, ups, fixes, found, nodes)
+    factors = assembled(settings, drives, ups, fixes, found, gaps, odometers, nodes)
     before = whitened_norms(factors, nodes)
     solution = solve(nodes, factors, settings.inlier_probability)
     covariance = marginals(solution)
-    for d in drives:
-        yield Part(poses_of(d, solution, covariance, origin), d.name)
-    yield graph_table(factors, before, whitened_norms(factors, solution.T), _key(drives))
+    for name, segments in groupby(drives, key=lambda d: d.name):
+        yield Part(Poses.concatenate([poses_of(d, solution, covariance, origin) for d in segments]), name)
+    remarks = guessed(drives, gaps, found, fixes)
+    after = whitened_norms(factors, solution.T)
+    yield dataclasses.replace(graph_table(factors, before, after, _key(drives)), remarks=remarks)
 
 
 def _key(drives: Sequence[Drive]) -> Callable[[int], str]:

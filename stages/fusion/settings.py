@@ -2,9 +2,30 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict, Field
 
 from scanloom.stages.fusion.gnss import GnssSettings
+
+
+class WheelSettings(BaseModel):
+    """How far gyro and wheels are trusted between keyframes."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rotation_deg_sqrt_m: float = Field(
+        default=0.03, gt=0, le=10, description="random walk of the turn per root of way, deg/sqrt(m)"
+    )
+    rotation_deg_sqrt_s: float = Field(
+        default=0.1, gt=0, le=10, description="random walk of the gyro per root of time, deg/sqrt(s)"
+    )
+    translation_m_sqrt_m: float = Field(
+        default=0.05,
+        gt=0,
+        le=10,
+        description="random walk of the way per root of way, m/sqrt(m); errors of scale last long, so it is generous",
+    )
 
 
 class Settings(BaseModel):
@@ -24,6 +45,12 @@ class Settings(BaseModel):
         le=10,
         description="random walk of odometry's translation added per root of distance, m/sqrt(m)",
     )
+    covariance: Literal["aware", "fixed"] = Field(
+        default="aware",
+        description="aware: directions that a registration did not see carry next to no weight, so that wheels and GNSS "
+        "decide there; fixed: every step of odometry weighs the same and wheels are not asked (for comparison)",
+    )
+    wheel: WheelSettings = Field(default_factory=WheelSettings, description="trust in gyro and wheels")
     gravity_sigma_deg: float = Field(
         default=1.5, gt=0, le=45, description="standard deviation of a measured up direction, deg"
     )

@@ -11,7 +11,7 @@ from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.stages.geometry.motion import MotionTrack
 from scanloom.stages.geometry.se3 import F8, inverse, se3_exp, se3_log
 from scanloom.stages.odometry.slip import SlipGate
-from scanloom.stages.odometry.traction import WheelScale, without_slips
+from scanloom.stages.geometry.traction import WheelScale, without_slips
 
 GYRO_STD_RAD_PER_SQRT_S = 0.002
 WHEEL_STD_SHARE = 0.02

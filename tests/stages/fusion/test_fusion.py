@@ -195,7 +195,7 @@ def test_imu_is_read_as_the_check_of_the_sensors_says() -> None:
             parts(a=gnss_of(WORLD)),
             parts(a=odd),
         )
-        *_, graph = fusion(Settings(), *given, parts(a=check))
+        *_, graph = fusion(Settings(), *given, check=parts(a=check))
         assert isinstance(graph, Graph)
         return int((graph.kind == "gravity").sum())
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scanloom.schemas.errors import StageError
-from scanloom.schemas.tracks import Gnss, Imu
+from scanloom.schemas.tracks import Gnss, Imu, Wheel
 from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.fusion import Settings, fusion, solving
 from scanloom.stages.fusion.alignment import align_level
@@ -28,7 +28,14 @@ from tests.stages.fusion.drives import (
 
 def drive_of(odometry: Odometry, world: World) -> Drive:
     return Drive(
-        "a", session_of("a", world), odometry, Gnss.empty(), Imu.empty(), 0, np.flatnonzero(odometry.keyframe)
+        "a",
+        session_of("a", world),
+        odometry,
+        Gnss.empty(),
+        Imu.empty(),
+        Wheel.empty(),
+        0,
+        np.flatnonzero(odometry.keyframe),
     )
 
 
@@ -90,7 +97,8 @@ def test_covariance_of_a_motion_is_carried_to_its_end() -> None:
     odometry.covariance[:] = np.diag(sigma**2)
     odometry.keyframe[:] = False
     odometry.keyframe[[30, 60]] = True
-    _, covariance = drive_of(odometry, world).keyframe_motions(1e-9, 1e-9)
+    drive = drive_of(odometry, world)
+    _, covariance = drive.keyframe_motions(1e-9, 1e-9, drive.step_covariance())
     np.testing.assert_allclose(np.sqrt(np.diag(covariance[0])), np.sqrt(np.diag(sampled)), rtol=0.08)
 
 

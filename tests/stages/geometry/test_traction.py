@@ -9,7 +9,7 @@ import pytest
 
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
-from scanloom.stages.odometry.traction import (
+from scanloom.stages.geometry.traction import (
     GRAVITY_M_S2,
     SLIP_M_S,
     Traction,
