@@ -14,7 +14,10 @@ from scanloom.schemas.product import Table, attribute, column
 
 @dataclass(frozen=True)
 class Graph(Table):
-    """One row per factor. Keys name keyframes as `session/scan_index`."""
+    """One row per factor. Keys name keyframes as `session/scan_index`.
+
+    Every fix of a session has its row of kind `gnss`, in the order of the fixes, used or not.
+    """
 
     NAME: ClassVar[str] = "graph"
 
@@ -35,6 +38,13 @@ class Graph(Table):
     )
     residual_before: NDArray[np.float64] = column("f8", "whitened norm at the initial values")
     residual_after: NDArray[np.float64] = column("f8", "whitened norm at the solution")
+    residual_m: NDArray[np.float64] = column(
+        "f8",
+        "gnss: antenna at the solution minus the fix; NaN for other kinds and without a fix",
+        unit="m",
+        shape=(3,),
+        frame="world or map",
+    )
     weight: NDArray[np.float64] = column("f8", "final robust weight, 0 switched off to 1 trusted")
     verdict: NDArray[np.object_] = column("str", "`used`, or why it was left out")
     remarks: Sequence[str] = attribute(

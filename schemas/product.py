@@ -139,7 +139,7 @@ class Table(Product):
             if name not in table.column_names:
                 raise ProductError(f"column {name} of {cls.NAME} is missing", where=where)
             arrays[name] = _from_arrow(table.column(name), spec, name, where)
-        if set(attributes) != set(attributes_of(cls)):
+        if not _required_attributes(cls) <= set(attributes) <= set(attributes_of(cls)):
             raise ProductError(f"attributes {sorted(attributes)} are not those of {cls.NAME}", where=where)
         return cls(**arrays, **attributes)
 
@@ -421,6 +421,13 @@ def columns_of(table: type[Table]) -> dict[str, Column]:
 @_per_type
 def attributes_of(table: type[Table]) -> dict[str, str]:
     return {f.name: f.metadata["attribute"] for f in dataclasses.fields(table) if "attribute" in f.metadata}
+
+
+@_per_type
+def _required_attributes(table: type[Table]) -> set[str]:
+    """Those without a default: files of a time when the others did not exist can still be read."""
+    defaults = {f.name: f.default for f in dataclasses.fields(table)}
+    return {name for name in attributes_of(table) if defaults[name] is dataclasses.MISSING}
 
 
 @_per_type

@@ -86,3 +86,7 @@ class Truth(Table):
         "f8", "pose of the LiDAR", unit="m", shape=(4, 4), frame="truth"
     )
     source: str = attribute("where the truth comes from and how far to trust it, in words")
+    georeference: dict[str, Any] | None = attribute(
+        "fields of `frames.Georeference` where the frame `truth` is east, north, up at a known place, else null",
+        default=None,
+    )

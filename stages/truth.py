@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from scanloom.schemas.errors import InvalidInput
+from scanloom.schemas.frames import Georeference
 from scanloom.schemas.session import IDENTITY, Matrix4, Problem, RawLog, TruthLog
 from scanloom.schemas.trajectory import Truth
 from scanloom.stages.geometry.geodesy import geodetic_to_world, georeference
@@ -79,8 +81,13 @@ def oxts_poses(oxts: Oxts) -> F8:
     Attitude by the development kit: R = Rz(yaw) Ry(pitch) Rx(roll), yaw 0 towards east, counter-clockwise.
     """
     lat, lon, height = oxts.geodetic.T
-    origin = georeference(lat[0], lon[0], height[0])
-    return pose(_from_roll_pitch_yaw(oxts.roll_pitch_yaw), geodetic_to_world(origin, lat, lon, height))
+    position = geodetic_to_world(oxts_origin(oxts), lat, lon, height)
+    return pose(_from_roll_pitch_yaw(oxts.roll_pitch_yaw), position)
+
+
+def oxts_origin(oxts: Oxts) -> Georeference:
+    """Where the frame of `oxts_poses` stands: at the first record."""
+    return georeference(*oxts.geodetic[0].tolist())
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -155,7 +162,7 @@ def _oxts(log: TruthLog) -> Truth | None:
         f"OXTS GNSS/INS of KITTI raw ({how}); its own accuracy figure is {oxts.accuracy_m.min():.2f} to "
         f"{oxts.accuracy_m.max():.2f} m; not independent of the GNSS positions and IMU that the pipeline reads"
     )
-    return Truth(stamp_ns=oxts.stamp_ns, T_truth_lidar=T, source=source)
+    return Truth(oxts.stamp_ns, T, source, oxts_origin(oxts).model_dump())
 
 
 def _in_order(found: Truth, offset_ns: int) -> Truth:
@@ -164,9 +171,9 @@ def _in_order(found: Truth, offset_ns: int) -> Truth:
     ordered = found if len(rows) == len(found) and (np.diff(rows) > 0).all() else found.take(rows)
     if offset_ns == 0:
         return ordered
-    return Truth(
+    return replace(
+        ordered,
         stamp_ns=ordered.stamp_ns + np.int64(offset_ns),
-        T_truth_lidar=ordered.T_truth_lidar,
         source=f"{ordered.source}; stamps moved by {offset_ns * 1e-9:+.3f} s",
     )
 

@@ -86,7 +86,18 @@ _RESIDUALS: dict[str, Callable[[Sequence[Factor], F8], tuple[F8, slice]]] = {
 }
 
 
-def graph_table(factors: Sequence[Factor], before: F8, after: F8, key: Callable[[int], str]) -> Graph:
+def position_residuals(factors: Sequence[Factor], T: F8) -> F8:
+    """Antenna minus fix (m, 3) of each factor of kind `gnss` at nodes T (n, 4, 4), m; NaN for the others."""
+    out = np.full((len(factors), 3), np.nan)
+    rows = np.array([k for k, f in enumerate(factors) if f.kind == "gnss"], np.int64)
+    if len(rows):
+        out[rows] = _gnss([factors[k] for k in rows], T)[0]
+    return out
+
+
+def graph_table(
+    factors: Sequence[Factor], before: F8, after: F8, residual_m: F8, key: Callable[[int], str]
+) -> Graph:
     """One row per factor, used or not. `key` names a node."""
     return Graph(
         kind=np.array([f.kind for f in factors], object),
@@ -96,6 +107,7 @@ def graph_table(factors: Sequence[Factor], before: F8, after: F8, key: Callable[
         covariance=np.array([f.covariance for f in factors], float).reshape(-1, 6, 6),
         residual_before=before,
         residual_after=after,
+        residual_m=residual_m,
         weight=np.array([0.0 if f.verdict else f.weight for f in factors], float),
         verdict=np.array([f.verdict or USED for f in factors], object),
     )

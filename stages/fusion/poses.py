@@ -23,7 +23,7 @@ from scanloom.stages.fusion.anchoring import anchor
 from scanloom.stages.fusion.assembly import assembled, odometers_of
 from scanloom.stages.fusion.bridging import bridges, guessed
 from scanloom.stages.fusion.drives import Drive, gather
-from scanloom.stages.fusion.factors import graph_table, whitened_norms
+from scanloom.stages.fusion.factors import graph_table, position_residuals, whitened_norms
 from scanloom.stages.fusion.gravity import gravity
 from scanloom.stages.fusion.links import links
 from scanloom.stages.fusion.placing import place_by_gnss, placed
@@ -73,7 +73,8 @@ def fusion(
         yield Part(Poses.concatenate([poses_of(d, solution, covariance, origin) for d in segments]), name)
     remarks = guessed(drives, gaps, found, fixes)
     after = whitened_norms(factors, solution.T)
-    yield dataclasses.replace(graph_table(factors, before, after, _key(drives)), remarks=remarks)
+    residual_m = position_residuals(factors, solution.T)
+    yield dataclasses.replace(graph_table(factors, before, after, residual_m, _key(drives)), remarks=remarks)
 
 
 def _key(drives: Sequence[Drive]) -> Callable[[int], str]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from scanloom.schemas.scans import TrueLabels, TruePoints
 from scanloom.schemas.trajectory import Truth
+from scanloom.stages.geometry.geodesy import georeference
 from scanloom.stages.simulate.motion import Motion, build_motion
 from scanloom.stages.simulate.recording import Recorder, entries
 from scanloom.stages.simulate.rig import T_BASE
@@ -55,7 +56,8 @@ class Drive:
         motion = self._driven()
         t = np.arange(int(self.settings.duration_s * 100) + 1) / 100
         stamps = self.settings.start_s * 1_000_000_000 + np.round(t * 1e9).astype(np.int64)
-        Truth(stamps, motion.poses(t) @ T_BASE["lidar"], SETTLED).write_to(stream)
+        origin = georeference(self.settings.latitude_deg, self.settings.longitude_deg, self.settings.height_m)
+        Truth(stamps, motion.poses(t) @ T_BASE["lidar"], SETTLED, origin.model_dump()).write_to(stream)
 
     def write_points(self, stream: IO[bytes]) -> None:
         self._driven()
