@@ -11,13 +11,14 @@ import numpy as np
 from scanloom.schemas.scans import TrueLabels, TruePoints
 from scanloom.schemas.trajectory import Truth
 from scanloom.stages.geometry.geodesy import georeference
+from scanloom.stages.simulate.estate import build_estate
 from scanloom.stages.simulate.motion import Motion, build_motion
 from scanloom.stages.simulate.recording import Recorder, entries
 from scanloom.stages.simulate.rig import T_BASE
 from scanloom.stages.simulate.route import build_path, ring
 from scanloom.stages.simulate.settings import Settings
 from scanloom.stages.simulate.sweeping import Lidar, Sweep, scene_of
-from scanloom.stages.simulate.town import build_town
+from scanloom.stages.simulate.town import Town, build_town
 from scanloom.stages.simulate.tracks import gnss_track, imu_track, wheel_track
 from scanloom.stages.simulate.traffic import build_traffic
 
@@ -35,9 +36,8 @@ class Drive:
 
     def write_log(self, stream: IO[bytes]) -> None:
         s = self.settings
-        town = build_town(s.town_seed, s.parking_seed, s.tunnel_m)
-        path = build_path(ring(), town.terrain) if s.route == "roundabout" else town.path
-        town.path = path
+        town = self._town()
+        path = town.path
         motion = build_motion(s, path)
         lidar = Lidar(s, town, motion, build_traffic(s, path, motion))
         gnss_settings = s if s.gnss else s.model_copy(update={"duration_s": 0.0})
@@ -48,6 +48,16 @@ class Drive:
             stream, entries(start_ns, sweeps, imu_track(s, motion), wheel_track(s, motion), gnss)
         )
         self._motion = motion
+
+    def _town(self) -> Town:
+        """The world with the path that is driven in it."""
+        s = self.settings
+        if s.route == "estate":
+            return build_estate(s.town_seed, s.parking_seed)
+        town = build_town(s.town_seed, s.parking_seed, s.tunnel_m)
+        if s.route == "roundabout":
+            town.path = build_path(ring(), town.terrain)
+        return town
 
     def write_metadata(self, stream: IO[bytes]) -> None:
         stream.write(self._recorder.metadata())

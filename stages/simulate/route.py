@@ -16,7 +16,6 @@ from scanloom.stages.simulate.terrain import (
     EAST_X,
     LANE_M,
     NORTH_Y,
-    OPENING,
     PLATEAU_Y,
     ROUNDABOUT,
     ROUNDABOUT_R,
@@ -115,7 +114,7 @@ def rounded(corners: F8, closed: bool = True) -> F8:
 
 
 def build_path(corners: F8, terrain: Terrain) -> Path:
-    """Smooth closed path over the built ground; it takes the bridge where it heads south over the opening."""
+    """Smooth closed path over the built ground, and over a bridge where there is one."""
     xy = gaussian_filter1d(rounded(corners), 2.4 / SAMPLE_M, axis=0, mode="wrap")
     step = np.hypot(*(np.roll(xy, -1, 0) - xy).T)
     s = np.concatenate(([0.0], np.cumsum(step)))
@@ -125,12 +124,7 @@ def build_path(corners: F8, terrain: Terrain) -> Path:
     curve = _periodic(s, np.vstack((xy, xy[:1])))
     p, d = curve(even[:-1]), curve(even[:-1], nu=1)
     normal = np.column_stack((-d[:, 1], d[:, 0])) / np.hypot(d[:, 0], d[:, 1])[:, None]
-    bridge = (
-        (np.abs(p[:, 0] - BRIDGE_X) < 4)
-        & (p[:, 1] > OPENING[0] - 2)
-        & (p[:, 1] < OPENING[1] + 2)
-        & (d[:, 1] < -0.5)
-    )
+    bridge = terrain.plan.on_deck(p, d)
     left, right = (_surface(terrain, p + side * TRACK_M * normal, bridge) for side in (1, -1))
     z = gaussian_filter1d((left + right) / 2, 1.5, mode="wrap")
     slope = gaussian_filter1d((left - right) / (2 * TRACK_M), 1.5, mode="wrap")
@@ -176,7 +170,7 @@ def _speed_limit(settings: Settings, path: Path) -> F8:
     s = np.arange(0, path.length_m, 0.5)
     p = path.at(s)
     bends = np.sqrt(LATERAL_M_S2 / np.maximum(np.abs(path.curvature(s)), 1e-3))
-    town = (p[:, 0] < 112) & (p[:, 1] < 140)
+    town = (settings.route == "estate") | ((p[:, 0] < 112) & (p[:, 1] < 140))
     v = np.minimum(bends, np.where(town, min(TOWN_SPEED_M_S, settings.top_speed_m_s), settings.top_speed_m_s))
     for k in range(2 * len(v) - 1, 0, -1):
         i = k % len(v)
@@ -186,7 +180,7 @@ def _speed_limit(settings: Settings, path: Path) -> F8:
 
 def _stops(settings: Settings, path: Path) -> list[tuple[float, float]]:
     """Arc length and time of rest: the light on South Street on the first pass, and where the bridge street ends."""
-    if settings.route == "roundabout":
+    if settings.route != "town":
         return []
     light, give_way = path.nearest(77.0, -LANE_M), path.nearest(BRIDGE_X - LANE_M, 11.0)
     laps = int((settings.start_m + settings.duration_s * settings.top_speed_m_s) / path.length_m) + 2

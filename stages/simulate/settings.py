@@ -28,8 +28,10 @@ class Settings(BaseModel):
         1_760_000_000, ge=0, le=4_000_000_000, description="time of the first sample since 1970, s"
     )
     duration_s: float = Field(180.0, ge=1.0, le=7200.0, description="length of the log, s")
-    route: Literal["town", "roundabout"] = Field(
-        "town", description="town: the whole lap, again and again; roundabout: circles of 54 m, a tiny loop"
+    route: Literal["town", "roundabout", "estate"] = Field(
+        "town",
+        description="town: the whole lap, again and again; roundabout: circles of 54 m, a tiny loop; estate: another world, "
+        "with parallel streets that look alike and one that repeats itself",
     )
     start_m: float = Field(0.0, ge=0.0, le=5000.0, description="place on the route where the drive starts, m")
     tunnel_m: float = Field(

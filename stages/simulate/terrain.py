@@ -1,6 +1,7 @@
 """The ground: height, roads, what it is made of.
 
-Coordinates are metres east, north and up of the town's origin. South Street runs along y = 0 into the tunnel and on to
+Coordinates are metres east, north and up of the origin. A `Layout` says where roads run and how the land rises; `Plan` is
+the town's: South Street runs along y = 0 into the tunnel and on to
 the field; the bridge carries a street along x = BRIDGE_X over North Street (y = NORTH_Y). A longer tunnel moves what lies
 east of it.
 """
@@ -8,6 +9,7 @@ east of it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -58,6 +60,23 @@ class Road:
         return np.where(inside, off, np.inf)
 
 
+class Layout(Protocol):
+    """What the ground is built from."""
+
+    @property
+    def east(self) -> float:
+        """Eastern edge of the ground, m; the other edges are WEST, SOUTH and NORTH."""
+
+    def roads(self) -> tuple[Road, ...]:
+        """All roads."""
+
+    def height(self, x: F8, y: F8) -> F8:
+        """Height of the ground, m."""
+
+    def on_deck(self, p: F8, d: F8) -> NDArray[np.bool_]:
+        """Whether a vehicle at places p (n, 3), heading along d (n, 3), is on a bridge rather than on the ground."""
+
+
 @dataclass(frozen=True)
 class Plan:
     """Where the tunnel ends and what lies beyond it: x in metres, for a tunnel of a given length."""
@@ -99,6 +118,14 @@ class Plan:
             Road((-66, 0), (-66, 0), town=False, centre=ROUNDABOUT),
         )
 
+    def height(self, x: F8, y: F8) -> F8:
+        return height(self, x, y)
+
+    def on_deck(self, p: F8, d: F8) -> NDArray[np.bool_]:
+        """The street along BRIDGE_X is driven southwards."""
+        over = (p[:, 1] > OPENING[0] - 2) & (p[:, 1] < OPENING[1] + 2)
+        return (np.abs(p[:, 0] - BRIDGE_X) < 4) & over & (d[:, 1] < -0.5)
+
 
 def smoothstep(u: ArrayLike) -> F8:
     """0 to 1 over u in 0..1 with two continuous derivatives."""
@@ -107,7 +134,7 @@ def smoothstep(u: ArrayLike) -> F8:
     return out
 
 
-def road_distance(plan: Plan, x: F8, y: F8) -> tuple[F8, NDArray[np.bool_]]:
+def road_distance(plan: Layout, x: F8, y: F8) -> tuple[F8, NDArray[np.bool_]]:
     """Distance to the nearest centre line, m, and whether that road is one of the town."""
     best, town = np.full(np.shape(x), np.inf), np.zeros(np.shape(x), bool)
     for road in plan.roads():
@@ -137,7 +164,7 @@ def height(plan: Plan, x: ArrayLike, y: ArrayLike) -> F8:
     on_ramp = embankment(x) * (south | north) * (y > 0)
     dip = DIP_M * np.exp(-(((x - BRIDGE_X) / 18) ** 2)) * (1 - smoothstep((np.abs(y - NORTH_Y) - 5) / 5))
     return (
-        relief(x, y) + plateau + on_ramp * (ramp - plateau) - dip * (1 - on_ramp) + _road_profile(plan, x, y)
+        relief(x, y) + plateau + on_ramp * (ramp - plateau) - dip * (1 - on_ramp) + road_profile(plan, x, y)
     )
 
 
@@ -147,7 +174,7 @@ def deck_height(x: ArrayLike, y: ArrayLike) -> F8:
     return relief(x, y) + RISE_M - 0.02 * np.minimum(np.abs(x - BRIDGE_X), 3.5)
 
 
-def _road_profile(plan: Plan, x: F8, y: F8) -> F8:
+def road_profile(plan: Layout, x: F8, y: F8) -> F8:
     """Camber of 2 % on the lanes, sidewalks 0.1 m above the road in town, verges 0.1 m below elsewhere."""
     d, town = road_distance(plan, x, y)
     camber = -0.02 * np.minimum(d, 3.5)
@@ -163,7 +190,7 @@ class Terrain:
     """(rows, columns) height at the grid's corners, m; row 0 is the south."""
     material: NDArray[np.uint8]
     """(rows, columns) `Material` of each raster cell."""
-    plan: Plan
+    plan: Layout
 
     def height(self, x: F8, y: F8) -> F8:
         """Height of the ground as it was built, m: bilinear between the corners."""
@@ -183,16 +210,16 @@ class Terrain:
         return grid_mesh(x, y, self.z.astype(float), Material.GRASS)
 
 
-def build_terrain(rng: np.random.Generator, plan: Plan) -> Terrain:
+def build_terrain(rng: np.random.Generator, plan: Layout) -> Terrain:
     """The ground with rough grass; roads stay smooth."""
     x, y = np.meshgrid(np.arange(WEST, plan.east + 0.1, CELL_M), np.arange(SOUTH, NORTH + 0.1, CELL_M))
     d, _ = road_distance(plan, x, y)
     rough = 0.006 + 0.04 * smoothstep((d - 6) / 4)
-    z = height(plan, x, y) + rough * rng.standard_normal(x.shape)
+    z = plan.height(x, y) + rough * rng.standard_normal(x.shape)
     return Terrain(z.astype(np.float32), _materials(plan), plan)
 
 
-def _materials(plan: Plan) -> NDArray[np.uint8]:
+def _materials(plan: Layout) -> NDArray[np.uint8]:
     x, y = np.meshgrid(
         np.arange(WEST, plan.east, RASTER_M) + 0.125, np.arange(SOUTH, NORTH, RASTER_M) + 0.125
     )

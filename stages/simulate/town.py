@@ -21,6 +21,7 @@ from scanloom.stages.simulate.terrain import (
     ROUNDABOUT,
     TUNNEL_M,
     TUNNEL_X,
+    Layout,
     Plan,
     Terrain,
     build_terrain,
@@ -51,6 +52,26 @@ STREETS = (
 )
 
 
+@dataclass(frozen=True)
+class Thing:
+    """A single object that stands about: its box above the ground."""
+
+    what: str
+    centre: F8
+    """(3,) m"""
+    yaw_rad: float
+    size_m: F8
+    """(3,) length, width and height along its own axes."""
+
+    @classmethod
+    def of(cls, what: str, mesh: Mesh, foot: F8, yaw_rad: float) -> Thing:
+        """The box of a mesh that was put somewhere; foundations do not count."""
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        low[2] = 0.0
+        middle = Mesh((low + high)[None] / 2, mesh.triangles[:0], mesh.material[:0])
+        return cls(what, middle.moved(foot, yaw_rad).vertices[0], yaw_rad, high - low)
+
+
 @dataclass
 class Town:
     """All triangles of what does not move, with what they are."""
@@ -60,17 +81,23 @@ class Town:
     parts: list[Mesh] = field(default_factory=list)
     classes: list[tuple[int, int]] = field(default_factory=list)
     """(class, instance) of each part."""
-    instances: int = 0
+    things: list[Thing] = field(default_factory=list)
+    """What has a number of its own, in the order of the numbers, from 1."""
 
-    def add(self, mesh: Mesh, kind: PointClass = PointClass.STATIC, *, instance: bool = False) -> None:
-        self.instances += instance
+    @property
+    def instances(self) -> int:
+        return len(self.things)
+
+    def add(self, mesh: Mesh, kind: PointClass = PointClass.STATIC, instance: int = 0) -> None:
         self.parts.append(mesh)
-        self.classes.append((int(kind), self.instances if instance else 0))
+        self.classes.append((int(kind), instance))
 
-    def put(self, mesh: Mesh, x: float, y: float, yaw_rad: float = 0.0, *, instance: bool = False) -> None:
-        """Stand a mesh on the ground."""
-        z = float(self.terrain.height(np.array(x), np.array(y)))
-        self.add(mesh.moved([x, y, z], yaw_rad), instance=instance)
+    def put(self, mesh: Mesh, x: float, y: float, yaw_rad: float = 0.0, *, thing: str = "") -> None:
+        """Stand a mesh on the ground; a `thing` gets a number of its own."""
+        foot = np.array([x, y, float(self.terrain.height(np.array(x), np.array(y)))])
+        if thing:
+            self.things.append(Thing.of(thing, mesh, foot, yaw_rad))
+        self.add(mesh.moved(foot, yaw_rad), instance=self.instances if thing else 0)
 
     def triangles(self) -> tuple[Mesh, NDArray[np.uint8], NDArray[np.uint16]]:
         """One mesh, and class and instance of each of its triangles."""
@@ -92,18 +119,18 @@ def build_town(town_seed: int, parking_seed: int, tunnel_m: float = TUNNEL_M) ->
     town.add(terrain.mesh(), PointClass.GROUND)
     for mesh, kind in (*bridge(), *tunnel(plan)):
         town.add(mesh, kind)
-    plots = _houses(town, rng)
-    free = _Free(plan, town.path, plots)
+    plots = _houses(town, plan, rng)
+    free = Free(plan, town.path, plots)
     _furniture(town, rng, free)
-    _greenery(town, rng, free)
+    _greenery(town, plan.beyond_m, rng, free)
     _parked_cars(town, np.random.default_rng((town_seed, 2, parking_seed)))
     return town
 
 
-class _Free:
+class Free:
     """Where something may stand: off the driven path, off the houses."""
 
-    def __init__(self, plan: Plan, path: Path, plots: list[F8]) -> None:
+    def __init__(self, plan: Layout, path: Path, plots: list[F8]) -> None:
         self._plan = plan
         self._path = cKDTree(path.at(np.arange(0, path.length_m, 0.5))[:, :2])
         self._plots = plots
@@ -121,7 +148,7 @@ def _inside(plot: F8, x: float, y: float) -> bool:
     return bool(plot[0, 0] - 0.3 < x < plot[1, 0] + 0.3 and plot[0, 1] - 0.3 < y < plot[1, 1] + 0.3)
 
 
-def _houses(town: Town, rng: np.random.Generator) -> list[F8]:
+def _houses(town: Town, plan: Plan, rng: np.random.Generator) -> list[F8]:
     """Rows of houses on both sides of every street; returns their outlines as corner pairs."""
     plots: list[F8] = []
     for street in STREETS:
@@ -135,9 +162,9 @@ def _houses(town: Town, rng: np.random.Generator) -> list[F8]:
                 corners = np.array([front - along * width / 2, front + along * width / 2 + across * depth])
                 plot = np.sort(corners, axis=0)
                 mesh = meshes.house(rng, width, depth, rng.uniform(*street.tall_m))
-                if _buildable(town.terrain.plan, plot, plots):
+                if _buildable(plan, plot, plots):
                     yaw = np.arctan2(across[1], across[0]) - np.pi / 2
-                    town.put(mesh, float(front[0]), float(front[1]), float(yaw), instance=True)
+                    town.put(mesh, float(front[0]), float(front[1]), float(yaw), thing="house")
                     plots.append(plot)
                 u += width + rng.uniform(*street.gap_m)
     return plots
@@ -152,7 +179,7 @@ def _buildable(plan: Plan, plot: F8, plots: list[F8]) -> bool:
     return not any((plot[0] < other[1] + 0.4).all() and (other[0] < plot[1] + 0.4).all() for other in plots)
 
 
-def _furniture(town: Town, rng: np.random.Generator, free: _Free) -> None:
+def _furniture(town: Town, rng: np.random.Generator, free: Free) -> None:
     """Street lamps, signs, walls and hedges in front of gardens."""
     for number, street in enumerate(STREETS):
         along = np.array(street.direction, float)
@@ -181,9 +208,8 @@ def _furniture(town: Town, rng: np.random.Generator, free: _Free) -> None:
                     town.put(wall, x, y, yaw)
 
 
-def _greenery(town: Town, rng: np.random.Generator, free: _Free) -> None:
+def _greenery(town: Town, beyond: float, rng: np.random.Generator, free: Free) -> None:
     """Trees along the streets and in gardens, bushes, an island with a tree, and little on the field."""
-    beyond = town.terrain.plan.beyond_m
     kinds = [meshes.tree(rng) for _ in range(12)]
     shrubs = [meshes.bush(rng) for _ in range(8)]
     for street in STREETS[:3]:
@@ -230,4 +256,4 @@ def _parked_cars(town: Town, rng: np.random.Generator) -> None:
                 )
                 if taken and crossing > 12 and path.query((x, y))[0] > 2.2:
                     heading = float(np.arctan2(along[1], along[0])) + np.pi * (side > 0) + lean
-                    town.put(meshes.car(paint, length, tall), x, y, heading, instance=True)
+                    town.put(meshes.car(paint, length, tall), x, y, heading, thing="car")

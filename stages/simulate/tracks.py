@@ -123,7 +123,8 @@ def gnss_track(settings: Settings, motion: Motion, scene: Any) -> GnssTrack:
     fixed = (seen >= 8) & ~_recently(seen < 6, int(SETTLING_S * GNSS_HZ))
     none = seen < 4
     sigma = np.where(fixed, 0.012, np.where(seen >= 6, 0.5, 1.6))
-    misled = _ramp(_in_canyon(antenna), 2 * GNSS_HZ)
+    canyon = _in_canyon(antenna) & (settings.route != "estate")
+    misled = _ramp(canyon, 2 * GNSS_HZ)
     slow = _correlated(rng, len(t), 30 * GNSS_HZ)
     wild = _correlated(rng, len(t), 10 * GNSS_HZ) + np.array([0.8, -0.5, 0.6])
     error = sigma[:, None] * (0.8 * slow + 0.6 * rng.standard_normal((len(t), 3))) * [1, 1, 1.8]
