@@ -25,9 +25,11 @@ from scanloom.schemas.session import Session
 from scanloom.schemas.tiles import TileIndex
 from scanloom.stages.report.page import compose, run_section
 from scanloom.workflows.configuration import Overrides, merged
-from scanloom.workflows.delivery import Metric, claim, deliver, metric_rows, write_text
+from scanloom.workflows.delivery import Label, Metric, claim, deliver, metric_rows, write_text
 from scanloom.workflows.map_session import NODES
-from scanloom.workflows.sessions import find_sessions
+from scanloom.workflows.parent import Parent, check_logs, check_new
+from scanloom.workflows.sessions import Sought, find_sessions
+from scanloom.workflows.sources import log_digests, write_sources
 
 METRICS_FILE = "metrics.json"
 REPORT_FILE = "report.html"
@@ -46,6 +48,14 @@ class Order:
     project: Overrides = field(default_factory=dict)
     command_line: Overrides = field(default_factory=dict)
     started_s: float = field(default_factory=time.time)
+    parent: Parent | None = None
+    """The map that is extended."""
+
+    @property
+    def settings(self) -> Overrides:
+        """Of all layers but the sessions' own."""
+        before = self.parent.settings if self.parent else {}
+        return merged(before, self.project, self.command_line)
 
 
 @dataclass(frozen=True)
@@ -75,16 +85,19 @@ def build_map(order: Order, progress: Progress | None = None) -> Outcome:
 
     A log that cannot be used is reported and left out; the map is made of the others.
     """
-    request, errors = request_of(order)
-    if not request.sessions:
+    sessions, errors = sessions_of(order)
+    if not sessions:
         return Outcome(order.out, _exit_code(errors, delivered=False), False, [], 0, errors, [])
+    store = Store(order.store)
     claim(order.out)
-    result = run(request, Store(order.store), cluster=order.cluster, workers=order.workers, progress=progress)
+    request = _request(order, sessions)
+    result = run(request, store, cluster=order.cluster, workers=order.workers, progress=progress)
     failures = errors + [(_place(task), task.error) for task in result.failures if task.error is not None]
     delivered = bool(result.files(ReportFiles)) and bool(result.files(TileIndex))
     metrics: list[Metric] = []
     if delivered:
-        deliver(result, order.out, order.name)
+        deliver(result, order.out, _label(order, log_digests(result, sessions, store)))
+        write_sources(order.out, sessions, order.settings, order.store)
         metrics = _deliver_figures(order, result)
     return Outcome(
         out=order.out,
@@ -100,13 +113,50 @@ def build_map(order: Order, progress: Progress | None = None) -> Outcome:
 
 def request_of(order: Order) -> tuple[Request, list[tuple[str, ScanloomError]]]:
     """What the engine is asked to do, and the logs that cannot be used."""
-    sessions, errors = find_sessions(order.sessions)
-    with_command_line = tuple(
-        dataclasses.replace(s, settings=merged(s.settings, order.command_line)) if s.settings else s
-        for s in sessions
-    )
-    settings = merged(order.project, order.command_line)
-    return Request(nodes=NODES, sessions=with_command_line, settings=settings), errors
+    sessions, errors = sessions_of(order)
+    return _request(order, sessions), errors
+
+
+def sessions_of(order: Order) -> tuple[list[Sought], list[tuple[str, ScanloomError]]]:
+    """The sessions of the map in order of their names, and the logs that cannot be used.
+
+    An extension without a single new session has none.
+
+    Raises
+    ------
+    InvalidInput : a log of the map that is extended has changed.
+    """
+    if order.parent is None:
+        new, errors = find_sessions(order.sessions)
+        return [_told(s, order) for s in new], errors
+    new, errors = find_sessions(order.sessions, {s.name for s in order.parent.sessions})
+    store, fresh = Store(order.store), []
+    check_logs(order.parent, store)
+    for session in new:
+        try:
+            check_new(order.parent, session, store)
+            fresh.append(_told(session, order))
+        except ScanloomError as error:
+            errors.append((session.word, error))
+    joined = [*order.parent.sessions, *fresh] if fresh else []
+    return sorted(joined, key=lambda s: s.name), errors
+
+
+def _told(session: Sought, order: Order) -> Sought:
+    """With the command line over what the session itself sets."""
+    own = session.input.settings
+    over = {stage: fields for stage, fields in order.command_line.items() if stage in own}
+    return dataclasses.replace(session, input=dataclasses.replace(session.input, settings=merged(own, over)))
+
+
+def _request(order: Order, sessions: list[Sought]) -> Request:
+    return Request(nodes=NODES, sessions=tuple(s.input for s in sessions), settings=order.settings)
+
+
+def _label(order: Order, logs: dict[str, str]) -> Label:
+    if order.parent is None:
+        return Label(order.name, logs=logs)
+    return Label(order.name, order.parent.version + 1, order.parent.reference(), logs)
 
 
 def _deliver_figures(order: Order, result: Result) -> list[Metric]:
@@ -176,7 +226,8 @@ def _provenance(order: Order, figures: list[Metric]) -> dict[str, str]:
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
         "made": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
         "sessions": ", ".join(order.sessions),
-        "settings changed": json.dumps(merged(order.project, order.command_line)) or "none",
+        **({"extends": f"{order.parent.name}, version {order.parent.version}"} if order.parent else {}),
+        "settings changed": json.dumps(order.settings) or "none",
         "wall time": f"{by_name.get('run.wall_s', 0):.1f} s for {by_name.get('run.log_s', 0):.1f} s of log",
         "real-time factor": f"{by_name.get('run.realtime_factor', 0):.2f}",
         "peak memory": f"{by_name.get('run.peak_rss_mb', 0):.0f} MB",

@@ -7,6 +7,7 @@ import logging
 import os
 import sys
 import time
+from enum import StrEnum
 from gc import set_threshold
 from pathlib import Path
 from typing import Annotated, Any
@@ -40,6 +41,14 @@ WorkersOption = Annotated[
 ProjectOption = Annotated[
     Path | None, typer.Option("--project", help="Settings file (default ./scanloom.yaml when present).")
 ]
+
+
+class Mode(StrEnum):
+    """What an extension does to the poses of the map."""
+
+    RIGID = "rigid"
+    SOFT = "soft"
+
 
 OBJECTS_BETWEEN_COLLECTIONS = 100_000
 """Imports make many objects that stay; looking for garbage among them every 700 objects took a quarter of their time."""
@@ -139,6 +148,62 @@ def map_command(
         workers=workers,
         project=project_settings(project),
         command_line=command_line_settings(settings or []),
+        started_s=_process_start_s(),
+    )
+    if dry_run:
+        _show_plan(*plan_map(order), as_json)
+        return
+    outcome = build_map(order, progress_for(sys.stderr))
+    _show_outcome(outcome, as_json)
+    raise typer.Exit(outcome.exit_code)
+
+
+@app.command()
+def extend(
+    folder: Annotated[
+        Path, typer.Argument(metavar="MAP", help="Folder of a finished map; it stays as it is.")
+    ],
+    sessions: Annotated[
+        list[str], typer.Argument(help="Logs to add, as for `map`; `sample2` fits `sample`.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder of the new version (default MAP-v2 beside it).")
+    ] = None,
+    mode: Annotated[
+        Mode, typer.Option("--mode", help="rigid: old poses stay; soft: they give way to new loops.")
+    ] = Mode.RIGID,
+    log: Annotated[
+        list[str] | None, typer.Option("--log", help="NAME=PATH: where the log of an old session lies now.")
+    ] = None,
+    store: StoreOption = None,
+    cluster: ClusterOption = "local",
+    workers: WorkersOption = None,
+    settings: SetOption = None,
+    project: ProjectOption = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would run and why; compute nothing.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Add sessions to a finished map: a new version beside it, with what has changed since."""
+    _start_workers(cluster, idle=dry_run)
+    from scanloom.pipeline.progress import progress_for
+    from scanloom.workflows.build_map import build_map, plan_map
+    from scanloom.workflows.configuration import command_line_settings, project_settings
+    from scanloom.workflows.extend_map import extension_order, moved_logs
+    from scanloom.workflows.parent import read_parent
+
+    told = store or os.environ.get("SCANLOOM_STORE")
+    order = extension_order(
+        read_parent(folder, moved_logs(log or [])),
+        sessions,
+        out=out,
+        store=Path(told) if told else None,
+        mode=mode.value,
+        project=project_settings(project) if project else {},
+        command_line=command_line_settings(settings or []),
+        cluster=cluster,
+        workers=workers,
         started_s=_process_start_s(),
     )
     if dry_run:

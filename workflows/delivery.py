@@ -6,8 +6,8 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,20 @@ from scanloom.stages.geometry.se3 import quaternion_from_matrix
 
 MARKER = ".scanloom"
 MAP_FILE = "map.json"
+MAP_FORMAT = "scanloom map 1"
 Metric = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Label:
+    """What a map is called, and what it was made of."""
+
+    name: str
+    version: int = 1
+    parent: dict[str, Any] | None = None
+    """Name, version and checksum of the map it extends."""
+    logs: Mapping[str, str] = field(default_factory=dict)
+    """Digest of each session's log."""
 
 
 def claim(out: Path) -> None:
@@ -53,7 +66,7 @@ class Item:
     source: Path | bytes
 
 
-def deliver(result: Result, out: Path, name: str) -> dict[str, Any]:
+def deliver(result: Result, out: Path, label: Label) -> dict[str, Any]:
     """Fill the folder with everything that does not vary between runs; returns the content of `map.json`."""
     items = list(_items(result))
     previous = read_map(out)
@@ -66,7 +79,7 @@ def deliver(result: Result, out: Path, name: str) -> dict[str, Any]:
             place(item.source, out / item.name)
     for stale in set(old) - set(files):
         (out / stale).unlink(missing_ok=True)
-    content = {**_description(result, name), "files": files}
+    content = {**_description(result, label), "files": files}
     place((json.dumps(content, indent=1, sort_keys=True) + "\n").encode(), out / MAP_FILE)
     return content
 
@@ -99,7 +112,6 @@ def metric_rows(metrics: Metrics) -> list[Metric]:
 
 
 def _items(result: Result) -> Iterable[Item]:
-    sessions = result.parts(Session)
     for _, path in result.files(MapFiles):
         yield Item("map.ply", path / "map.ply")
     for coordinate, path in result.files(Tile):
@@ -108,12 +120,18 @@ def _items(result: Result) -> Iterable[Item]:
         yield Item(f"tiles/{dict(coordinate)['tile']}.ply", path / "tile.ply")
     for _, path in result.files(TileIndex):
         yield Item("tiles/index.parquet", path)
-    for coordinate, path in result.files(Poses):
-        stem = "trajectory" if len(sessions) == 1 else f"trajectory/{dict(coordinate)['session']}"
-        yield Item(f"{stem}.parquet", path)
-        yield Item(f"{stem}.tum", trajectory_tum(Poses.open(path)))
+    poses = result.files(Poses)
+    for coordinate, path in poses:
+        name = trajectory_file(dict(coordinate)["session"], len(poses))
+        yield Item(name, path)
+        yield Item(f"{name.removesuffix('.parquet')}.tum", trajectory_tum(Poses.open(path)))
     for _, path in result.files(PictureFiles):
         yield Item("preview.png", path / "preview.png")
+
+
+def trajectory_file(session: str, sessions: int) -> str:
+    """Where a map of so many sessions keeps the poses of this one."""
+    return "trajectory.parquet" if sessions == 1 else f"trajectory/{session}.parquet"
 
 
 def trajectory_tum(poses: Poses) -> bytes:
@@ -129,26 +147,29 @@ def trajectory_tum(poses: Poses) -> bytes:
     return "".join(lines).encode()
 
 
-def _description(result: Result, name: str) -> dict[str, Any]:
+def _description(result: Result, label: Label) -> dict[str, Any]:
     index = result.parts(TileIndex)[0]
+    mapped = {dict(coordinate)["session"] for coordinate, _ in result.files(Poses)}
     keys = {dict(coordinate)["session"]: path.parent.name for coordinate, path in result.files(Session)}
     sessions = [
         {
-            "name": s.name,
+            "name": name,
+            "log": label.logs.get(name, ""),
             "scans": s.scan_count,
             "start_ns": s.start_ns,
             "end_ns": s.end_ns,
             "complete": s.complete,
             "problems": [p.text for p in s.problems if p.severity != "info"],
         }
-        for s in result.parts(Session)
+        for name, s in _by_name(result)
+        if name in mapped
     ]
     bounds = (index.min_m.min(axis=0), index.max_m.max(axis=0)) if len(index) else (np.zeros(3), np.zeros(3))
     return {
-        "format": "scanloom map 1",
-        "name": name,
-        "version": 1,
-        "parent": None,
+        "format": MAP_FORMAT,
+        "name": label.name,
+        "version": label.version,
+        "parent": label.parent,
         "frame": index.frame,
         "crs": index.georeference,
         "epsg": index.georeference["epsg"] if index.georeference else None,
@@ -160,6 +181,11 @@ def _description(result: Result, name: str) -> dict[str, Any]:
         "sessions": sessions,
         "session_artifacts": keys,
     }
+
+
+def _by_name(result: Result) -> list[tuple[str, Session]]:
+    """Sessions by their names in this run, which keep two logs of the same name apart."""
+    return [(where["session"], session) for where, session in result.parts(Session).items()]
 
 
 def _digest(source: Path | bytes) -> tuple[str, int]:

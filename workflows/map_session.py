@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from scanloom.pipeline.node import Node, node
+from scanloom.schemas.base import Base, BaseLog
 from scanloom.schemas.evaluation import ErrorTrack, Metrics, PictureFiles, ReportFiles
 from scanloom.schemas.loops import Loops, Places
 from scanloom.schemas.pose_graph import Graph
@@ -13,6 +14,7 @@ from scanloom.schemas.tiles import MapFiles, Piece, Tile, TileFiles, TileIndex
 from scanloom.schemas.tracks import Gnss, Imu, Wheel
 from scanloom.schemas.trajectory import Odometry, Poses, Truth
 from scanloom.schemas.windows import Track, TrackEnds, Window
+from scanloom.stages.base import base
 from scanloom.stages.denoise import denoise
 from scanloom.stages.deskew import deskew
 from scanloom.stages.evaluation import evaluation
@@ -35,6 +37,7 @@ SIMULATED = "simulated"
 # fmt: off
 NODES: tuple[Node, ...] = (
     node("simulate",   simulate,   per="session", reads=(),                                    writes=(RawLog, TruthLog), only=SIMULATED),
+    node("base",       base,       per="session", reads=(BaseLog,),                            writes=Base),
     node("truth",      truth,      per="session", reads=(TruthLog,),                           writes=Truth),
     node("ingest",     ingest,     per="session", reads=(RawLog,),                             writes=(Scans, Imu, Gnss, Wheel, Session)),
     node("sensors",    sensors,    per="session", reads=(Scans, Session, Imu, Wheel),          writes=SensorCheck),
@@ -45,7 +48,7 @@ NODES: tuple[Node, ...] = (
     node("odometry",   odometry,   per="session", reads=(Deskewed, Labels, Session, Imu, Wheel, SensorCheck, Track, TrackEnds), writes=Odometry),
     node("places",     places,     per="session", reads=(Deskewed, Labels, Odometry),          writes=Places),
     node("loops",      loops,      per="map",     reads=(Deskewed, Labels, Odometry, Places),  writes=Loops),
-    node("fusion",     fusion,     per="map",     reads=(Session, Odometry, Loops, Gnss, Imu, Wheel, SensorCheck), writes=(Poses, Graph)),
+    node("fusion",     fusion,     per="map",     reads=(Session, Odometry, Loops, Gnss, Imu, Wheel, SensorCheck, Base), writes=(Poses, Graph)),
     node("tiling",     tiling,     per="chunk",   reads=(Deskewed, Labels, Poses),             writes=Piece),
     node("tiles",      tiles,      per="tile",    reads=(Piece,),                              writes=(Tile, TileFiles)),
     node("overview",   overview,   per="map",     reads=(Tile,),                               writes=(TileIndex, MapFiles)),

@@ -11,6 +11,7 @@ from itertools import groupby
 
 import numpy as np
 
+from scanloom.schemas.base import Base
 from scanloom.schemas.errors import StageError
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.pose_graph import Graph
@@ -21,8 +22,10 @@ from scanloom.schemas.tracks import Gnss, Imu, Wheel
 from scanloom.schemas.trajectory import Odometry, Poses
 from scanloom.stages.fusion.anchoring import anchor
 from scanloom.stages.fusion.assembly import assembled, odometers_of
+from scanloom.stages.fusion.base import base_map
 from scanloom.stages.fusion.bridging import bridges, guessed
 from scanloom.stages.fusion.drives import Drive, gather
+from scanloom.stages.fusion.extending import final, held, on_base, on_ties
 from scanloom.stages.fusion.factors import graph_table, position_residuals, whitened_norms
 from scanloom.stages.fusion.gravity import gravity
 from scanloom.stages.fusion.links import links
@@ -45,11 +48,12 @@ def fusion(
     imu: Parts[Imu],
     wheel: Parts[Wheel] | None = None,
     check: Parts[SensorCheck] | None = None,
+    base: Parts[Base] | None = None,
 ) -> Iterator[Part[Poses] | Graph]:
     """Optimised poses of every scan, one part per session, then the graph.
 
     The frame is `world` (east, north, up at the first accepted fix) when at least one session's GNSS tells its place
-    and heading, else `map` (z up, origin at the first scan of the first session).
+    and heading, else `map` (z up, origin at the first scan of the first session). Of a map that is extended it stays.
 
     Raises
     ------
@@ -61,17 +65,21 @@ def fusion(
     ups = [gravity(d, settings.gravity_spacing_m) for d in drives]
     odometers = odometers_of(settings, drives)
     gaps = bridges(drives, odometers)
-    origin, fixes = place_by_gnss(settings, drives, ups)
+    old = base_map(base)
+    origin, fixes = place_by_gnss(settings, drives, ups, old)
     found = links(drives, loops)
-    starts = anchor(drives, placed(drives, ups, fixes), found, gaps)
-    nodes = np.concatenate([starts[k] @ d.odometry.T_odom_lidar[d.keyframes] for k, d in enumerate(drives)])
+    anchored, fixed = on_base(drives, old)
+    starts = anchor(anchored, placed(drives, ups, fixes, fixed), found, gaps)
+    nodes = np.concatenate([starts[k] @ d.odometry.T_odom_lidar[d.keyframes] for k, d in enumerate(anchored)])
     factors = assembled(settings, drives, ups, fixes, found, gaps, odometers, nodes)
+    factors = held(settings, factors, drives, old)
     before = whitened_norms(factors, nodes)
     solution = solve(nodes, factors, settings.inlier_probability)
     covariance = marginals(solution)
     for name, segments in groupby(drives, key=lambda d: d.name):
-        yield Part(Poses.concatenate([poses_of(d, solution, covariance, origin) for d in segments]), name)
-    remarks = guessed(drives, gaps, found, fixes)
+        solved = Poses.concatenate([poses_of(d, solution, covariance, origin) for d in segments])
+        yield Part(final(settings, name, solved, old), name)
+    remarks = guessed(drives, gaps, found, fixes) + on_ties(drives, fixes, factors, old)
     after = whitened_norms(factors, solution.T)
     residual_m = position_residuals(factors, solution.T)
     yield dataclasses.replace(graph_table(factors, before, after, residual_m, _key(drives)), remarks=remarks)

@@ -72,4 +72,14 @@ class Settings(BaseModel):
         lt=1,
         description="chi-square probability up to which a loop or fix is an inlier",
     )
+    extension: Literal["rigid", "soft"] = Field(
+        default="rigid",
+        description="of a map that is extended: rigid keeps the poses it has; soft lets them give way to new loops",
+    )
+    extension_deadband_m: float = Field(
+        default=0.02,
+        ge=0,
+        le=1,
+        description="soft: stretches of the map that move by less stay as they are, and so do their tiles, m",
+    )
     gnss: GnssSettings = Field(default_factory=GnssSettings, description="gates and weights of GNSS")

@@ -147,7 +147,7 @@ def _gtsam_factor(gtsam: Any, f: Factor) -> Any:
     if f.kind in ("odometry", "loop"):
         model = gtsam.noiseModel.Gaussian.Covariance(f.covariance)
         return gtsam.BetweenFactorPose3(f.i, f.j, gtsam.Pose3(f.measurement), model)
-    if f.kind == "prior":
+    if f.kind in ("prior", "base"):
         model = gtsam.noiseModel.Gaussian.Covariance(f.covariance)
         return gtsam.PriorFactorPose3(f.i, gtsam.Pose3(f.measurement), model)
     if f.kind == "gnss":
