@@ -17,7 +17,7 @@ USED = "used"
 class Factor:
     """One measurement between nodes `i` and `j` (j is -1 for a measurement of one node).
 
-    kind `odometry`, `loop`, `prior`, `base`: `measurement` is the pose of j in i, or of i itself;
+    kind `odometry`, `wheel`, `loop`, `prior`, `base`: `measurement` is the pose of j in i, or of i itself;
     kind `gnss`: position (3,) of the antenna in the last column, `arm_m` the antenna in the frame of node i;
     kind `gravity`: up (3,) in the frame of node i in the last column.
     """
@@ -79,6 +79,7 @@ def _gravity(factors: Sequence[Factor], T: F8) -> tuple[F8, slice]:
 
 _RESIDUALS: dict[str, Callable[[Sequence[Factor], F8], tuple[F8, slice]]] = {
     "odometry": _between,
+    "wheel": _between,
     "loop": _between,
     "prior": _prior,
     "base": _prior,

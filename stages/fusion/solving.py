@@ -144,7 +144,7 @@ def _gtsam_graph(factors: Sequence[Factor]) -> Any:
 
 
 def _gtsam_factor(gtsam: Any, f: Factor) -> Any:
-    if f.kind in ("odometry", "loop"):
+    if f.kind in ("odometry", "wheel", "loop"):
         model = gtsam.noiseModel.Gaussian.Covariance(f.covariance)
         return gtsam.BetweenFactorPose3(f.i, f.j, gtsam.Pose3(f.measurement), model)
     if f.kind in ("prior", "base"):
