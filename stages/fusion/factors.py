@@ -80,7 +80,6 @@ def _gravity(factors: Sequence[Factor], T: F8) -> tuple[F8, slice]:
 _RESIDUALS: dict[str, Callable[[Sequence[Factor], F8], tuple[F8, slice]]] = {
     "odometry": _between,
     "wheel": _between,
-    "wheel": _between,
     "loop": _between,
     "prior": _prior,
     "base": _prior,
