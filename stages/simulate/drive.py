@@ -12,15 +12,17 @@ from scanloom.schemas.scans import TrueLabels, TruePoints
 from scanloom.schemas.trajectory import Truth
 from scanloom.stages.geometry.geodesy import georeference
 from scanloom.stages.simulate.estate import build_estate
+from scanloom.stages.simulate.gnss import GnssTrack, gnss_track
 from scanloom.stages.simulate.motion import Motion, build_motion
 from scanloom.stages.simulate.recording import Recorder, entries
 from scanloom.stages.simulate.rig import T_BASE
 from scanloom.stages.simulate.route import build_path, ring
 from scanloom.stages.simulate.settings import Settings
 from scanloom.stages.simulate.sweeping import Lidar, Sweep, scene_of
-from scanloom.stages.simulate.town import Town, build_town
-from scanloom.stages.simulate.tracks import gnss_track, imu_track, wheel_track
+from scanloom.stages.simulate.town import Thing, Town, build_town
+from scanloom.stages.simulate.tracks import imu_track, wheel_track
 from scanloom.stages.simulate.traffic import build_traffic
+from scanloom.stages.simulate.truths import true_fixes, true_objects
 
 SETTLED = "simulated: exact"
 
@@ -33,6 +35,8 @@ class Drive:
         self._recorder = Recorder()
         self._labels: list[tuple[bytes, bytes]] = []
         self._motion: Motion | None = None
+        self._gnss: GnssTrack | None = None
+        self._things: list[Thing] = []
 
     def write_log(self, stream: IO[bytes]) -> None:
         s = self.settings
@@ -44,10 +48,11 @@ class Drive:
         gnss = gnss_track(gnss_settings, motion, scene_of(town.triangles()[0]))
         sweeps = self._noting_truth(lidar.sweeps())
         start_ns = s.start_s * 1_000_000_000
+        frames = {name: T for name, T in T_BASE.items() if name != "gnss" or s.gnss_lever_arm_known}
         self._recorder.record(
-            stream, entries(start_ns, sweeps, imu_track(s, motion), wheel_track(s, motion), gnss)
+            stream, entries(start_ns, sweeps, imu_track(s, motion), wheel_track(s, motion), gnss, frames)
         )
-        self._motion = motion
+        self._motion, self._gnss, self._things = motion, gnss, town.things
 
     def _town(self) -> Town:
         """The world with the path that is driven in it."""
@@ -72,6 +77,15 @@ class Drive:
     def write_points(self, stream: IO[bytes]) -> None:
         self._driven()
         TruePoints(self._true_labels()).write_to(stream)
+
+    def write_fixes(self, stream: IO[bytes]) -> None:
+        self._driven()
+        assert self._gnss is not None  # noqa: S101  (write_log sets it)
+        true_fixes(self.settings.start_s, self._gnss).write_to(stream)
+
+    def write_objects(self, stream: IO[bytes]) -> None:
+        self._driven()
+        true_objects(self._things).write_to(stream)
 
     def _driven(self) -> Motion:
         """The motion, after the log was written."""

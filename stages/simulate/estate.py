@@ -223,7 +223,7 @@ class _Side:
     def furnish(self, town: Town, y: float, rng: np.random.Generator, free: Free) -> None:
         """Lamps at equal places; trees and gardens of which a share differs from street to street."""
         side = float(self._across[1])
-        yaw = np.pi / 2 * (1 + side)
+        yaw = np.pi / 2 * (1 - side)
         for x in (*(self._west + u for u in self._lamps), *(self._east + u for u in self._east_lamps)):
             if free(float(x), y + 6.3 * side, road_m=5.9):
                 town.put(meshes.lamp(), float(x), y + 6.3 * side, yaw)
@@ -233,8 +233,8 @@ class _Side:
             if free(x, y + off * side, road_m=6.0):
                 town.put(other if changed else mesh, x, y + off * side, turn if changed else 0.0)
         for x, usual in self._gardens:
-            changed, other = rng.random() < CHANGED, _garden(rng, 5.5)
-            kept = other if changed else usual
+            changed, own = rng.random() < CHANGED, _garden(rng, 5.5)
+            kept = own if changed else usual
             if kept is not None and free(x, y + 8.5 * side, road_m=8.0):
                 town.put(kept, x, y + 8.5 * side)
 

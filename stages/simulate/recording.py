@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import IO, Any
@@ -14,9 +14,9 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from scanloom.stages.geometry.se3 import F8, quaternion_from_matrix
-from scanloom.stages.simulate.rig import T_BASE
+from scanloom.stages.simulate.gnss import GnssTrack
 from scanloom.stages.simulate.sweeping import Sweep
-from scanloom.stages.simulate.tracks import GnssTrack, ImuTrack, WheelTrack
+from scanloom.stages.simulate.tracks import ImuTrack, WheelTrack
 
 LOG_FILE = "sample_0.mcap"
 LIDAR, IMU, WHEEL, GNSS, TF = "/lidar/points", "/imu/data", "/wheel/twist", "/gnss/fix", "/tf_static"
@@ -121,10 +121,15 @@ def _qos(topic: str) -> str:
 
 
 def entries(
-    start_ns: int, sweeps: Iterator[Sweep], imu: ImuTrack, wheel: WheelTrack, gnss: GnssTrack
+    start_ns: int,
+    sweeps: Iterator[Sweep],
+    imu: ImuTrack,
+    wheel: WheelTrack,
+    gnss: GnssTrack,
+    frames: Mapping[str, F8],
 ) -> Iterator[Entry]:
-    """All messages in the order of their reception."""
-    streams = (_tf(start_ns), _clouds(sweeps), _imu(imu), _wheel(wheel), _gnss(gnss))
+    """All messages in the order of their reception; `frames` are the poses of sensors that the log tells."""
+    streams = (_tf(start_ns, frames), _clouds(sweeps), _imu(imu), _wheel(wheel), _gnss(gnss))
     return heapq.merge(*streams, key=lambda entry: entry[0])
 
 
@@ -187,9 +192,9 @@ def _gnss(track: GnssTrack) -> Iterator[Entry]:
         yield stamp + DELAY_NS[GNSS], GNSS, stamp, _serialise(GNSS, message)
 
 
-def _tf(start_ns: int) -> Iterator[Entry]:
-    frames = [_transform(start_ns, child, T) for child, T in T_BASE.items()]
-    yield start_ns, TF, start_ns, _serialise(TF, _class(TYPES[TF])(frames))
+def _tf(start_ns: int, frames: Mapping[str, F8]) -> Iterator[Entry]:
+    transforms = [_transform(start_ns, child, T) for child, T in frames.items()]
+    yield start_ns, TF, start_ns, _serialise(TF, _class(TYPES[TF])(transforms))
 
 
 def _transform(stamp_ns: int, child: str, T: F8) -> Any:

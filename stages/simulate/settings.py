@@ -94,6 +94,22 @@ class Settings(BaseModel):
     gnss_multipath_m: float = Field(
         4.0, ge=0.0, le=50.0, description="size of the lie between high houses, m"
     )
+    gnss_outage_s: float = Field(
+        0.0,
+        ge=0.0,
+        le=3600.0,
+        description="the receiver finds no position for so long, s; the first ones after it are off by metres and called good",
+    )
+    gnss_outage_at_s: float = Field(
+        0.0, ge=0.0, le=7200.0, description="the outage begins so long after the start, s"
+    )
+    gnss_lies: float = Field(
+        0.0, ge=0.0, le=1.0, description="share of fixes that are off by 5 to 30 m and called good"
+    )
+    gnss_clock_s: float = Field(
+        0.0, ge=-10.0, le=10.0, description="error of the clock that stamps the fixes, s"
+    )
+    gnss_lever_arm_known: bool = Field(True, description="the log tells where on the vehicle the antenna is")
     latitude_deg: float = Field(
         48.137, ge=-80.0, le=80.0, description="WGS84 latitude of the town's origin, deg"
     )

@@ -20,9 +20,10 @@ __all__ = ["VERSION", "Settings", "simulate"]
 def simulate(settings: Settings) -> tuple[RawLog, TruthLog]:
     """Drive once; returns the log and, apart from it, the truth.
 
-    RawLog: `sample_0.mcap` and `metadata.yaml`, a rosbag2 folder. TruthLog: `trajectory.parquet` (pose of the LiDAR at 100 Hz)
-    and `points.parquet` (class and instance of every point, in the order of the messages). Both are made in one drive, when
-    the log is written.
+    RawLog: `sample_0.mcap` and `metadata.yaml`, a rosbag2 folder. TruthLog: `trajectory.parquet` (pose of the LiDAR at 100 Hz),
+    `points.parquet` (class and instance of every point, in the order of the messages), `fixes.parquet` (where the antenna
+    was at every fix, and which fixes lie) and `objects.parquet` (boxes of parked cars and houses). All are made in one
+    drive, when the log is written.
     """
     from scanloom.stages.simulate.drive import Drive
     from scanloom.stages.simulate.recording import LOG_FILE
@@ -30,6 +31,11 @@ def simulate(settings: Settings) -> tuple[RawLog, TruthLog]:
     drive = Drive(settings)
     log = RawLog(contents={LOG_FILE: drive.write_log, "metadata.yaml": drive.write_metadata})
     truth = TruthLog(
-        contents={"trajectory.parquet": drive.write_trajectory, "points.parquet": drive.write_points}
+        contents={
+            "trajectory.parquet": drive.write_trajectory,
+            "points.parquet": drive.write_points,
+            "fixes.parquet": drive.write_fixes,
+            "objects.parquet": drive.write_objects,
+        }
     )
     return log, truth

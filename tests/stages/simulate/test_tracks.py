@@ -7,12 +7,13 @@ import pytest
 
 from scanloom.stages.geometry.geodesy import geodetic_to_world, georeference
 from scanloom.stages.geometry.se3 import F8, so3_exp, so3_log
+from scanloom.stages.simulate.gnss import GnssTrack, gnss_track
 from scanloom.stages.simulate.motion import Motion, build_motion
 from scanloom.stages.simulate.rig import T_BASE
 from scanloom.stages.simulate.settings import Settings
 from scanloom.stages.simulate.sweeping import scene_of
 from scanloom.stages.simulate.town import build_town
-from scanloom.stages.simulate.tracks import GRAVITY_M_S2, GnssTrack, gnss_track, imu_track, wheel_track
+from scanloom.stages.simulate.tracks import GRAVITY_M_S2, imu_track, wheel_track
 
 LAP = Settings(duration_s=150.0)
 

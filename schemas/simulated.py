@@ -1,0 +1,55 @@
+"""Truth that only a simulator has, apart from poses and points; for evaluation and tests, never read by the pipeline."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.schemas.product import Table, column
+
+
+class Lie(IntEnum):
+    """Why a fix is off although the receiver calls it good."""
+
+    NONE = 0
+    MULTIPATH = 1
+    RECOVERY = 2
+    MOVED = 3
+
+
+@dataclass(frozen=True)
+class TrueFixes(Table):
+    """One row per message of the GNSS receiver: where its antenna was, and what was made of it."""
+
+    NAME: ClassVar[str] = "true_fixes"
+
+    stamp_ns: NDArray[np.int64] = column("i8", "stamp of the message, on the receiver's clock", unit="ns")
+    true_ns: NDArray[np.int64] = column("i8", "true time of the measurement, on the LiDAR's clock", unit="ns")
+    antenna_m: NDArray[np.float64] = column(
+        "f8", "where the antenna was: east, north, up", unit="m", shape=(3,), frame="truth"
+    )
+    error_m: NDArray[np.float64] = column(
+        "f8", "what the reported position is off by; NaN without fix", unit="m", shape=(3,), frame="truth"
+    )
+    lie: NDArray[np.uint8] = column("u1", "a value of Lie")
+
+
+@dataclass(frozen=True)
+class TrueObjects(Table):
+    """One row per object that stands about: a box around it above the ground."""
+
+    NAME: ClassVar[str] = "true_objects"
+
+    instance: NDArray[np.uint16] = column("u2", "its number in `true_points`")
+    what: NDArray[np.object_] = column("str", "`car` or `house`")
+    x_m: NDArray[np.float64] = column("f8", "middle of its box, east", unit="m", frame="truth")
+    y_m: NDArray[np.float64] = column("f8", "middle of its box, north", unit="m", frame="truth")
+    z_m: NDArray[np.float64] = column("f8", "middle of its box, up", unit="m", frame="truth")
+    yaw_rad: NDArray[np.float64] = column("f8", "direction of its length, from east", unit="rad")
+    length_m: NDArray[np.float64] = column("f8", "size along its own x", unit="m")
+    width_m: NDArray[np.float64] = column("f8", "size along its own y", unit="m")
+    height_m: NDArray[np.float64] = column("f8", "size upwards from the ground", unit="m")
