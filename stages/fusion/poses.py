@@ -33,6 +33,7 @@ from scanloom.stages.fusion.placing import place_by_gnss, placed
 from scanloom.stages.fusion.settings import Settings
 from scanloom.stages.fusion.solving import marginals, solve
 from scanloom.stages.fusion.spreading import poses_of
+from scanloom.stages.fusion.tuning import tuned
 
 __all__ = ["VERSION", "Settings", "fusion"]
 
@@ -63,6 +64,7 @@ def fusion(
     if not drives:
         raise StageError("there is no session to fuse", next_step="add a session to the map")
     ups = [gravity(d, settings.gravity_spacing_m) for d in drives]
+    drives, told = tuned(settings.gnss, drives, ups)
     odometers = odometers_of(settings, drives)
     gaps = bridges(drives, odometers)
     old = base_map(base)
@@ -79,7 +81,7 @@ def fusion(
     for name, segments in groupby(drives, key=lambda d: d.name):
         solved = Poses.concatenate([poses_of(d, solution, covariance, origin) for d in segments])
         yield Part(final(settings, name, solved, old), name)
-    remarks = guessed(drives, gaps, found, fixes) + on_ties(drives, fixes, factors, old)
+    remarks = told + guessed(drives, gaps, found, fixes) + on_ties(drives, fixes, factors, old)
     after = whitened_norms(factors, solution.T)
     residual_m = position_residuals(factors, solution.T)
     yield dataclasses.replace(graph_table(factors, before, after, residual_m, _key(drives)), remarks=remarks)

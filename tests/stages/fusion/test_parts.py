@@ -9,9 +9,11 @@ from scanloom.schemas.errors import StageError
 from scanloom.schemas.tracks import Gnss, Imu, Wheel
 from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.fusion import Settings, fusion, solving
+from scanloom.stages.fusion.agreement import longest_chain
 from scanloom.stages.fusion.alignment import align_level
 from scanloom.stages.fusion.drives import Drive
-from scanloom.stages.fusion.gnss import GnssSettings, consistent_chain, receiver_sigma
+from scanloom.stages.fusion.gnss_settings import GnssSettings
+from scanloom.stages.fusion.receiver import receiver_sigma
 from scanloom.stages.geometry.se3 import inverse, pose, se3_exp, se3_log, so3_exp
 from tests.stages.fusion.drives import (
     START_NS,
@@ -64,9 +66,9 @@ def test_alignment_gives_up_on_a_standing_vehicle() -> None:
 
 def test_chain_goes_around_a_stretch_that_is_off_and_follows_slow_drift() -> None:
     path = np.arange(0, 300, 5.0)
-    residual = np.column_stack((0.02 * path, np.zeros(60)))
-    residual[25:40, 1] += 4.0
-    keep = consistent_chain(residual, path, np.full(60, 0.05), GnssSettings())
+    residual = 0.02 * path + 0j
+    residual[25:40] += 4.0j
+    keep = longest_chain(residual, path, np.full(60, 0.05), 0.3, 0.04, 400.0)
     assert keep[:25].all()
     assert not keep[25:40].any()
     assert keep[40:].all()
