@@ -52,7 +52,7 @@ NODES: tuple[Node, ...] = (
     node("tiling",     tiling,     per="chunk",   reads=(Deskewed, Labels, Poses),             writes=Piece),
     node("tiles",      tiles,      per="tile",    reads=(Piece,),                              writes=(Tile, TileFiles)),
     node("overview",   overview,   per="map",     reads=(Tile,),                               writes=(TileIndex, MapFiles)),
-    node("evaluation", evaluation, per="map",     reads=(Session, Truth, Odometry, Poses, Loops, Tile, SensorCheck), writes=(Metrics, ErrorTrack)),
+    node("evaluation", evaluation, per="map",     reads=(Session, Truth, Odometry, Poses, Loops, Graph, Gnss, Tile, SensorCheck), writes=(Metrics, ErrorTrack)),
     node("picture",    picture,    per="map",     reads=(Session, Poses, Loops, TileIndex, Tile, Gnss), writes=PictureFiles),
     node("report",     report,     per="map",     reads=(Session, Metrics, ErrorTrack, Poses, Loops, TileIndex, PictureFiles, Gnss, SensorCheck), writes=ReportFiles),
 )

@@ -1,111 +1,96 @@
-"""Loop closures against truth: which are true, and how many of the revisits were found."""
+"""Which scans come back to a place, by truth: what a search for loops ought to find."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanloom.schemas.loops import Loops
-from scanloom.schemas.trajectory import Odometry, Truth
-from scanloom.stages.evaluation.figures import Figure
-from scanloom.stages.geometry import alignment
-from scanloom.stages.geometry.interpolation import inside, interpolate_poses
-from scanloom.stages.geometry.se3 import F8, inverse
+from scanloom.stages.evaluation.paths import I8, TruePath
+from scanloom.stages.geometry.se3 import F8
 
-REVISIT_DISTANCE_M = 4.0
-REVISIT_PATH_M = 50.0
+FARTHEST_M = 10.0
+"""Places farther apart than this are never the same."""
+LEFT_BEFORE_M, LEFT_BEFORE_S = 50.0, 30.0
+"""So much path and time lies between two passes of one session."""
 FOUND_WITHIN_M = 10.0
+"""A scan counts as found when a right loop ends within this much path of it."""
+
+Ends = tuple[F8, F8]
+"""Where along the path of a session loops end (m,), m, and a value of each (m,)."""
+NO_ENDS: Ends = (np.empty(0), np.empty(0))
 
 
 @dataclass(frozen=True)
-class TruePath:
-    """True poses (n, 4, 4) of the scans of one session that truth covers, and their numbers (n,)."""
+class Revisits:
+    """Keyframes of all sessions with truth, each a query for places seen before (methods 2.6)."""
 
-    scan_index: NDArray[np.int64]
-    T: F8
+    session: NDArray[np.int64]
+    """(n,) number of the session in `names`."""
+    names: tuple[str, ...]
+    travelled_m: F8
+    """(n,) along the path of its session."""
+    nearest_m: F8
+    """(n,) distance to the nearest earlier place: of another session, or left long before; inf without any."""
 
-    def at(self, scans: NDArray[np.int64]) -> tuple[F8, NDArray[np.bool_]]:
-        """Poses of scans (m,), and which of them truth covers."""
-        if len(self.scan_index) == 0:
-            return np.tile(np.eye(4), (len(scans), 1, 1)), np.zeros(len(scans), bool)
-        row = np.clip(np.searchsorted(self.scan_index, scans), 0, len(self.scan_index) - 1)
-        return self.T[row], self.scan_index[row] == scans
+    def first_found(self, ends: Mapping[str, Ends]) -> F8:
+        """Smallest value (n,) of the loops that end within `FOUND_WITHIN_M` of path of each keyframe; inf without any."""
+        first = np.full(len(self.session), np.inf)
+        starts = np.searchsorted(self.session, np.arange(len(self.names) + 1))
+        for number, name in enumerate(self.names):
+            own = slice(starts[number], starts[number + 1])
+            at, value = ends.get(name, NO_ENDS)
+            low = starts[number] + np.searchsorted(self.travelled_m[own], at - FOUND_WITHIN_M)
+            high = starts[number] + np.searchsorted(self.travelled_m[own], at + FOUND_WITHIN_M, side="right")
+            for a, b, v in zip(low, high, value):
+                first[a:b] = np.minimum(first[a:b], v)
+        return first
+
+    def positive(self, within_m: float) -> NDArray[np.bool_]:
+        """Keyframes (n,) that come back to within `within_m` of a place."""
+        return np.asarray(self.nearest_m <= within_m)
 
 
-def true_path(truth: Truth, odometry: Odometry) -> TruePath:
-    """True poses of the scans that odometry has and truth covers."""
-    covered = inside(truth.stamp_ns, odometry.stamp_ns)
-    if not covered.any():
-        return TruePath(np.empty(0, np.int64), np.empty((0, 4, 4)))
-    T = interpolate_poses(truth.stamp_ns, truth.T_truth_lidar, odometry.stamp_ns[covered])
-    return TruePath(odometry.scan_index[covered], T)
+def revisits(paths: Mapping[str, TruePath]) -> Revisits:
+    """Keyframes of all paths and how near each comes to an earlier place.
 
-
-def loop_figures(
-    loops: Loops, paths: dict[str, TruePath], max_error_m: float, max_error_deg: float
-) -> Iterator[Figure]:
-    """Counts of loops, and precision and recall where truth covers them.
-
-    Only loops within one session are judged, because truths of two sessions need not share a frame.
+    Earlier means: of a session driven before, in the same frame of truth, or `LEFT_BEFORE_M` and `LEFT_BEFORE_S` before
+    in its own.
     """
-    yield Figure("loops.candidates", len(loops), "", "pairs of places compared", "map")
-    yield Figure("loops.accepted", int(loops.accepted.sum()), "", "pairs that entered the pose graph", "map")
-    judged, true = judge(loops, paths, max_error_m, max_error_deg)
-    if judged.any():
-        how = (
-            f"share of {int(judged.sum())} accepted loops within one session whose relative pose is within "
-            f"{max_error_m:g} m and {max_error_deg:g} deg of truth"
-        )
-        yield Figure("loops.precision", float(true[judged].mean()), "", how, "map")
-    found, revisits = recall(loops, true, paths)
-    if revisits:
-        how = (
-            f"share of {revisits} scans back within {REVISIT_DISTANCE_M:g} m of a place left "
-            f"{REVISIT_PATH_M:g} m of path before, with a true loop within {FOUND_WITHIN_M:g} m of path"
-        )
-        yield Figure("loops.recall", found / revisits, "", how, "map")
+    names = tuple(sorted(paths))
+    kept = [paths[name].keyframe for name in names]
+    session = np.repeat(np.arange(len(names)), [int(mask.sum()) for mask in kept])
+    travelled = _joined([paths[n].travelled_m[mask] for n, mask in zip(names, kept)], np.float64)
+    stamp_ns = _joined([paths[n].stamp_ns[mask] for n, mask in zip(names, kept)], np.int64)
+    position = _joined([paths[n].T[mask, :3, 3] for n, mask in zip(names, kept)], np.float64).reshape(-1, 3)
+    frames = np.array([paths[n].frame for n in names], object)[session] if len(names) else np.empty(0, object)
+    nearest = np.full(len(session), np.inf)
+    for frame in sorted(set(frames)):
+        rows = np.flatnonzero(frames == frame)
+        nearest[rows] = _nearest_earlier(position[rows], session[rows], travelled[rows], stamp_ns[rows])
+    return Revisits(session, names, travelled, nearest)
 
 
-def judge(
-    loops: Loops, paths: dict[str, TruePath], max_error_m: float, max_error_deg: float
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which loops (n,) are accepted and can be judged, and which of these are true."""
-    judged, true = np.zeros(len(loops), bool), np.zeros(len(loops), bool)
-    for session, path in paths.items():
-        rows = np.flatnonzero(loops.accepted & (loops.session_i == session) & (loops.session_j == session))
-        T_i, known_i = path.at(loops.scan_i[rows])
-        T_j, known_j = path.at(loops.scan_j[rows])
-        metres, radians = alignment.motion_error(inverse(T_i) @ T_j, loops.T_i_j[rows])
-        judged[rows] = known_i & known_j
-        true[rows] = judged[rows] & (metres < max_error_m) & (np.degrees(radians) < max_error_deg)
-    return judged, true
-
-
-def recall(loops: Loops, true: NDArray[np.bool_], paths: dict[str, TruePath]) -> tuple[int, int]:
-    """How many scans that come back to a place have a true loop near, and how many come back at all."""
-    found = revisits = 0
-    for session, path in paths.items():
-        if len(path.T) < 2:
-            continue
-        travelled = alignment.travelled(path.T)
-        back = travelled[_comes_back(path.T[:, :3, 3], travelled)]
-        rows = true & (loops.session_i == session) & (loops.session_j == session)
-        closed = travelled[np.searchsorted(path.scan_index, loops.scan_j[rows])]
-        revisits += len(back)
-        if len(closed):
-            found += int((np.abs(back[:, None] - closed).min(axis=1) <= FOUND_WITHIN_M).sum())
-    return found, revisits
-
-
-def _comes_back(positions: F8, travelled: F8) -> NDArray[np.bool_]:
-    """Which positions (n, 3) lie near one that was left long before along the path."""
+def _nearest_earlier(position: F8, session: I8, travelled: F8, stamp_ns: I8) -> F8:
+    """Distance (n,) of each position to the nearest one that was left before."""
     from scipy.spatial import cKDTree
 
-    pairs = cKDTree(positions).query_pairs(REVISIT_DISTANCE_M, output_type="ndarray")
-    later = pairs[travelled[pairs[:, 1]] - travelled[pairs[:, 0]] > REVISIT_PATH_M][:, 1]
-    back = np.zeros(len(positions), bool)
-    back[later] = True
-    return back
+    pairs = cKDTree(position).query_pairs(FARTHEST_M, output_type="ndarray")
+    a, b = pairs[:, 0], pairs[:, 1]
+    swap = stamp_ns[a] > stamp_ns[b]
+    a, b = np.where(swap, b, a), np.where(swap, a, b)
+    long_ago = (stamp_ns[b] - stamp_ns[a] >= LEFT_BEFORE_S * 1e9) & (
+        travelled[b] - travelled[a] >= LEFT_BEFORE_M
+    )
+    old = (session[a] != session[b]) | long_ago
+    a, b = a[old], b[old]
+    nearest = np.full(len(position), np.inf)
+    np.minimum.at(nearest, b, np.linalg.norm(position[a] - position[b], axis=1))
+    return nearest
+
+
+def _joined(arrays: list[Any], dtype: type) -> Any:
+    return np.concatenate(arrays) if arrays else np.empty(0, dtype)

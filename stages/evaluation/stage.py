@@ -3,21 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from scanloom.schemas.evaluation import ErrorTrack, Metrics
 from scanloom.schemas.loops import Loops
-from scanloom.schemas.product import Part, Parts
+from scanloom.schemas.pose_graph import Graph
+from scanloom.schemas.product import Part, Parts, ProductT
 from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.session import Session
 from scanloom.schemas.tiles import Tile
+from scanloom.schemas.tracks import Gnss
 from scanloom.schemas.trajectory import Odometry, Poses, Truth
 from scanloom.stages.evaluation.crispness import map_figures
+from scanloom.stages.evaluation.degenerate import degeneracy_figures
 from scanloom.stages.evaluation.figures import Figure, to_metrics
-from scanloom.stages.evaluation.revisits import loop_figures, true_path
+from scanloom.stages.evaluation.fixes import fix_figures
+from scanloom.stages.evaluation.loops import judged, loop_figures
+from scanloom.stages.evaluation.paths import TruePath, true_paths
+from scanloom.stages.evaluation.revisits import revisits
+from scanloom.stages.evaluation.search import search_figures
 from scanloom.stages.evaluation.sensors import sensor_figures
+from scanloom.stages.evaluation.sessions import session_figures
 from scanloom.stages.evaluation.trajectories import error_track, trajectory_figures, truth_figures
+from scanloom.stages.geometry.factor_rows import FixRows, fix_rows
 
 VERSION = 1
 
@@ -50,6 +60,8 @@ def evaluation(
     odometry: Parts[Odometry],
     poses: Parts[Poses],
     loops: Loops,
+    graph: Graph,
+    gnss: Parts[Gnss],
     tiles: Parts[Tile],
     check: Parts[SensorCheck] | None = None,
 ) -> Iterator[Part[ErrorTrack] | Metrics]:
@@ -57,27 +69,62 @@ def evaluation(
 
     What needs truth is left out where there is none.
     """
-    truths = {c["session"]: t for c, t in truth.items() if len(t)}
-    odometries = {c["session"]: o for c, o in odometry.items()}
-    optimised = {c["session"]: p for c, p in poses.items()}
-    checks = {c["session"]: found for c, found in check.items()} if check is not None else {}
+    given = _Given(
+        _by_session(truth), _by_session(odometry), _by_session(poses), _by_session(gnss), _by_session(check)
+    )
+    truths = {name: t for name, t in given.truths.items() if len(t)}
+    fixes = fix_rows(graph)
     figures: list[Figure] = []
-    for name in sorted(odometries.keys() & optimised.keys()):
-        figures += _of(name, trajectory_figures(odometries[name], optimised[name]))
-        if name in checks:
-            figures += _of(name, sensor_figures(checks[name]))
+    for name in sorted(given.odometries.keys() & given.poses.keys()):
+        figures += _of(name, _session_figures(name, given, fixes))
         if name in truths:
-            figures += _of(name, truth_figures(truths[name], odometries[name], optimised[name]))
-            track = error_track(truths[name], odometries[name], optimised[name])
+            track = error_track(truths[name], given.odometries[name], given.poses[name])
             if track is not None:
                 yield Part(track, name)
-    paths = {name: true_path(t, odometries[name]) for name, t in truths.items() if name in odometries}
-    figures += loop_figures(loops, paths, settings.loop_error_m, settings.loop_error_deg)
-    figures.append(_georeferenced(optimised))
+    paths = true_paths(truths, given.odometries)
+    figures += _loop_figures(settings, loops, graph, paths)
+    figures += session_figures(paths, given.poses)
+    figures.append(_georeferenced(given.poses))
     figures += map_figures(
         tiles, settings.entropy_radii_m, settings.entropy_neighbours, settings.entropy_samples, settings.seed
     )
     yield to_metrics(figures)
+
+
+@dataclass(frozen=True)
+class _Given:
+    """Products of each session by its name."""
+
+    truths: dict[str, Truth]
+    odometries: dict[str, Odometry]
+    poses: dict[str, Poses]
+    gnss: dict[str, Gnss]
+    checks: dict[str, SensorCheck]
+
+
+def _session_figures(name: str, given: _Given, fixes: dict[str, FixRows]) -> Iterator[Figure]:
+    odometry, poses = given.odometries[name], given.poses[name]
+    yield from trajectory_figures(odometry, poses)
+    yield from degeneracy_figures(odometry)
+    if name in given.checks:
+        yield from sensor_figures(given.checks[name])
+    if name in fixes and name in given.gnss:
+        yield from fix_figures(given.gnss[name], fixes[name], poses.georeference is not None)
+    if name in given.truths and len(given.truths[name]):
+        yield from truth_figures(given.truths[name], odometry, poses)
+
+
+def _loop_figures(
+    settings: Settings, loops: Loops, graph: Graph, paths: dict[str, TruePath]
+) -> Iterator[Figure]:
+    judgement, back = judged(loops, paths), revisits(paths)
+    true = judgement.right(settings.loop_error_m, settings.loop_error_deg)
+    yield from loop_figures(loops, graph, judgement, true, paths, back)
+    yield from search_figures(loops, judgement, paths, back)
+
+
+def _by_session(parts: Parts[ProductT] | None) -> dict[str, ProductT]:
+    return {} if parts is None else {c["session"]: product for c, product in parts.items()}
 
 
 def _of(session: str, figures: Iterator[Figure]) -> list[Figure]:

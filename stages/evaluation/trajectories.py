@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.schemas.evaluation import ErrorTrack
+from scanloom.schemas.frames import Georeference
 from scanloom.schemas.trajectory import Odometry, Poses, Truth
 from scanloom.stages.evaluation.figures import Figure
 from scanloom.stages.geometry import alignment
+from scanloom.stages.geometry.geodesy import between_worlds
 from scanloom.stages.geometry.interpolation import inside, interpolate_poses
-from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.se3 import F8, inverse
 
 RPE_LENGTHS_M = (1, 5, 10, 20)
 
@@ -38,6 +40,21 @@ def truth_figures(truth: Truth, odometry: Odometry, poses: Poses) -> Iterator[Fi
         if name == "fusion":
             yield from _coverage(true, covered, truth.source)
         yield from _error_figures(name, true, T[covered])
+        if name == "fusion":
+            yield from _map_figures(truth, true, poses.take(covered))
+
+
+def _map_figures(truth: Truth, true: F8, poses: Poses) -> Iterator[Figure]:
+    """Errors on the Earth, and whether the marginal covariances tell the truth of the errors."""
+    T_world_truth = _on_earth(truth, poses)
+    if T_world_truth is None:
+        T_world_truth = alignment.umeyama(poses.T_world_lidar[:, :3, 3], true[:, :3, 3])
+        how = "truth aligned as a whole"
+    else:
+        how = "nothing aligned"
+        moved = (T_world_truth @ true)[:, :3, 3]
+        yield from _absolute_figures(np.linalg.norm(moved - poses.T_world_lidar[:, :3, 3], axis=1))
+    yield _honesty(T_world_truth @ true, poses.T_world_lidar, poses.covariance, how)
 
 
 def error_track(truth: Truth, odometry: Odometry, poses: Poses) -> ErrorTrack | None:
@@ -91,3 +108,29 @@ def _error_figures(name: str, true: F8, estimate: F8) -> Iterator[Figure]:
         how = f"KITTI odometry benchmark: mean over {kitti.segments} segments of 100 to 800 m from every tenth scan"
         yield Figure(f"{name}.kitti_t_rel_percent", kitti.t_rel_percent, "%", how)
         yield Figure(f"{name}.kitti_r_rel_deg_per_100m", kitti.r_rel_deg_per_100m, "deg/100m", how)
+
+
+def _absolute_figures(errors: F8) -> Iterator[Figure]:
+    how = "distance to truth on the Earth, nothing aligned"
+    yield Figure("fusion.absolute_rmse_m", alignment.rms(errors), "m", f"root mean square {how}")
+    yield Figure("fusion.absolute_max_m", float(errors.max()), "m", f"largest {how}")
+
+
+def _on_earth(truth: Truth, poses: Poses) -> F8 | None:
+    """T_world_truth (4, 4) where both the map and truth stand on the Earth, else None."""
+    if poses.georeference is None or truth.georeference is None:
+        return None
+    return between_worlds(Georeference(**poses.georeference), Georeference(**truth.georeference))
+
+
+def _honesty(true: F8, estimate: F8, covariance: F8, how: str) -> Figure:
+    """Mean of e^T C^-1 e over the poses, e the error of position in the LiDAR's frame (Bar-Shalom et al. 2001, 5.4)."""
+    error = (inverse(estimate) @ true)[:, :3, 3]
+    C = covariance[:, 3:, 3:]
+    usable = np.isfinite(C).all(axis=(1, 2)) & (np.linalg.det(C) > 0)
+    error, C = error[usable], C[usable]
+    squared = np.einsum("ni,ni->n", error, np.linalg.solve(C, error[..., None])[..., 0])
+    method = (
+        f"mean squared error of position over its marginal covariance, {how}; 3 is honest, more is too sure"
+    )
+    return Figure("fusion.nees_translation", float(squared.mean()) if len(squared) else np.nan, "", method)

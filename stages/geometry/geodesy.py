@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from scanloom.schemas.errors import StageError
 from scanloom.schemas.frames import Georeference
-from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.se3 import F8, pose
 
 WGS84_SEMI_MAJOR_M = 6378137.0
 WGS84_ECCENTRICITY_SQUARED = 6.69437999014e-3
@@ -81,6 +81,15 @@ def world_to_geodetic(origin: Georeference, points: ArrayLike) -> F8:
     p = np.asarray(points, float).reshape(-1, 3)
     lon, lat, h = _topocentric(origin).transform(p[:, 0], p[:, 1], p[:, 2], direction="INVERSE")
     return np.column_stack((lat, lon, h))
+
+
+def between_worlds(target: Georeference, source: Georeference) -> F8:
+    """T_target_source (4, 4) between two frames `world`; exact, since both are Cartesian."""
+    if target == source:
+        return np.eye(4)
+    corners = np.concatenate((np.zeros((1, 3)), 1000.0 * np.eye(3)))
+    moved = geodetic_to_world(target, *world_to_geodetic(source, corners).T)
+    return pose((moved[1:] - moved[0]).T / 1000.0, moved[0])
 
 
 def world_to_projected(origin: Georeference, points: ArrayLike) -> F8:

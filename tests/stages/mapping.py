@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from scanloom.schemas.loops import Loops
+from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.product import Part, Parts
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
 from scanloom.schemas.session import Session
@@ -75,6 +76,34 @@ def loops_of(T: F8, pairs: Sequence[tuple[int, int]], errors_m: Sequence[float],
         source=np.full(n, "position", object), temporal_distance=np.full(n, np.nan), segment_distance=np.full(n, np.nan),
         seen_through=np.zeros(n), e1_m=np.zeros(n), rival=np.zeros(n),
         accepted=np.ones(n, bool), reason=np.array(["verified"] * n, object),
+    )  # fmt: skip
+
+
+def graph_of(loops: Loops, verdicts: Sequence[str] | None = None, remarks: Sequence[str] = ()) -> Graph:
+    """The pose graph that took in the accepted loops; used unless told otherwise."""
+    rows = np.flatnonzero(loops.accepted)
+    n = len(rows)
+    return Graph(
+        kind=np.full(n, "loop", object),
+        key_i=np.array([f"{loops.session_i[k]}/{loops.scan_i[k]}" for k in rows], object),
+        key_j=np.array([f"{loops.session_j[k]}/{loops.scan_j[k]}" for k in rows], object),
+        measurement=loops.T_i_j[rows], covariance=loops.covariance[rows], residual_before=np.full(n, 2.0),
+        residual_after=np.ones(n), residual_m=np.full((n, 3), np.nan),
+        weight=np.array([1.0 if v == "used" else 0.0 for v in verdicts or ["used"] * n]),
+        verdict=np.array(verdicts or ["used"] * n, object), remarks=remarks,
+    )  # fmt: skip
+
+
+def fixes_graph(positions: F8, residual_m: F8, verdicts: Sequence[str], session: str = "a") -> Graph:
+    """One factor per fix on the scan of the same number."""
+    n = len(positions)
+    measurement = np.tile(np.eye(4), (n, 1, 1))
+    measurement[:, :3, 3] = positions
+    return Graph(
+        kind=np.full(n, "gnss", object), key_i=np.array([f"{session}/{k}" for k in range(n)], object),
+        key_j=np.full(n, "", object), measurement=measurement, covariance=np.tile(np.eye(6), (n, 1, 1)),
+        residual_before=np.full(n, 2.0), residual_after=np.ones(n), residual_m=residual_m,
+        weight=np.array([float(v == "used") for v in verdicts]), verdict=np.array(verdicts, object),
     )  # fmt: skip
 
 

@@ -32,6 +32,7 @@ from scanloom.stages.tiling import overview
 from scanloom.stages.tiling.overview import Settings as OverviewSettings
 from tests.stages.mapping import (
     Source,
+    graph_of,
     loops_of,
     no_gnss,
     odometry_of,
@@ -107,7 +108,8 @@ class Map:
     ) -> tuple[Metrics, Parts[ErrorTrack]]:
         *tracks, metrics = evaluation(
             EvaluationSettings(), given["session"], one(truth_of(self.T)),
-            one(odometry_of(self.T if odometry is None else odometry)), given["poses"], given["loops"], given["tiles"],
+            one(odometry_of(self.T if odometry is None else odometry)), given["poses"], given["loops"],
+            graph_of(given["loops"]), given["gnss"], given["tiles"],
         )  # fmt: skip
         return metrics, Parts([((("session", part.key),), part.product) for part in tracks])  # type: ignore[return-value, union-attr]
 
