@@ -50,3 +50,4 @@ class Graph(Table):
     remarks: Sequence[str] = attribute(
         "what a user should know of the map's making, in sentences", default=()
     )
+    warnings: Sequence[str] = attribute("what casts doubt on a part of the map, in sentences", default=())

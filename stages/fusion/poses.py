@@ -81,10 +81,11 @@ def fusion(
     for name, segments in groupby(drives, key=lambda d: d.name):
         solved = Poses.concatenate([poses_of(d, solution, covariance, origin) for d in segments])
         yield Part(final(settings, name, solved, old), name)
-    remarks = told + guessed(drives, gaps, found, fixes) + on_ties(drives, fixes, factors, old)
+    warnings = guessed(drives, gaps, found, fixes) + on_ties(drives, fixes, factors, old)
     after = whitened_norms(factors, solution.T)
     residual_m = position_residuals(factors, solution.T)
-    yield dataclasses.replace(graph_table(factors, before, after, residual_m, _key(drives)), remarks=remarks)
+    table = graph_table(factors, before, after, residual_m, _key(drives))
+    yield dataclasses.replace(table, remarks=told, warnings=warnings)
 
 
 def _key(drives: Sequence[Drive]) -> Callable[[int], str]:
