@@ -21,11 +21,12 @@ from scanloom.pipeline.run import Result, run
 from scanloom.pipeline.store import Store
 from scanloom.schemas.errors import EXIT_INTERNAL, EXIT_OK, EXIT_SOME_FAILED, ScanloomError
 from scanloom.schemas.evaluation import Metrics, ReportFiles
+from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.session import Session
 from scanloom.schemas.tiles import TileIndex
 from scanloom.stages.report.page import compose, run_section
 from scanloom.workflows.configuration import Overrides, merged
-from scanloom.workflows.delivery import Label, Metric, claim, deliver, metric_rows, write_text
+from scanloom.workflows.delivery import Label, Metric, change_rows, claim, deliver, metric_rows, write_text
 from scanloom.workflows.map_session import NODES
 from scanloom.workflows.parent import Parent, check_logs, check_new
 from scanloom.workflows.sessions import Sought, find_sessions
@@ -161,7 +162,7 @@ def _label(order: Order, logs: dict[str, str]) -> Label:
 
 def _deliver_figures(order: Order, result: Result) -> list[Metric]:
     """`metrics.json` and `report.html`. Their `run.*` part describes the last run that computed something."""
-    metrics = metric_rows(result.parts(Metrics)[0])
+    metrics = metric_rows(result.parts(Metrics)[0]) + change_rows(result)
     previous = _run_metrics(order.out / METRICS_FILE)
     figures = previous if result.executed == 0 and previous else _measured(order, result)
     metrics += figures
@@ -235,13 +236,14 @@ def _provenance(order: Order, figures: list[Metric]) -> dict[str, str]:
 
 
 def _warnings(result: Result) -> list[str]:
-    """Problems of the logs that a user should read even when all went well."""
-    return [
-        f"{session.name}: {problem.text}"
-        for session in result.parts(Session)
+    """Problems of the logs, and of how they fit together, that a user should read even when all went well."""
+    of_logs = [
+        f"{where['session']}: {problem.text}"
+        for where, session in result.parts(Session).items()
         for problem in session.problems
         if problem.severity != "info"
     ]
+    return of_logs + [remark for graph in result.parts(Graph) for remark in graph.remarks]
 
 
 def _place(task: Any) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from scanloom.pipeline.run import Result
+from scanloom.schemas.changes import ChangeFiles, Changes
 from scanloom.schemas.errors import StoreError, UsageError
 from scanloom.schemas.evaluation import Metrics, PictureFiles
 from scanloom.schemas.session import Session
@@ -111,6 +112,23 @@ def metric_rows(metrics: Metrics) -> list[Metric]:
     return rows
 
 
+def change_rows(result: Result) -> list[Metric]:
+    """What an extension saw change; nothing for a map that extends none."""
+    found = [table for table in result.parts(Changes) if table.sessions]
+    if not found:
+        return []
+    points, objects = sum(map(len, found)), sum(len(np.unique(table.object_)) for table in found)
+    method = "standing points of the old map, one per voxel, that new sessions saw through and hardly met"
+
+    def row(name: str, value: int, method: str) -> Metric:
+        return {"name": name, "value": float(value), "unit": "", "scope": "map", "method": method}
+
+    return [
+        row("changes.points", points, method),
+        row("changes.objects", objects, "such points gathered by distance"),
+    ]
+
+
 def _items(result: Result) -> Iterable[Item]:
     for _, path in result.files(MapFiles):
         yield Item("map.ply", path / "map.ply")
@@ -125,6 +143,12 @@ def _items(result: Result) -> Iterable[Item]:
         name = trajectory_file(dict(coordinate)["session"], len(poses))
         yield Item(name, path)
         yield Item(f"{name.removesuffix('.parquet')}.tum", trajectory_tum(Poses.open(path)))
+    for _, path in result.files(Changes):
+        if Changes.open(path).sessions:
+            yield Item("changes.parquet", path)
+    for _, path in result.files(ChangeFiles):
+        if (path / "changes.ply").exists():
+            yield Item("changes.ply", path / "changes.ply")
     for _, path in result.files(PictureFiles):
         yield Item("preview.png", path / "preview.png")
 

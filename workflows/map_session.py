@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from scanloom.pipeline.node import Node, node
 from scanloom.schemas.base import Base, BaseLog
+from scanloom.schemas.changes import ChangeFiles, Changes
 from scanloom.schemas.evaluation import ErrorTrack, Metrics, PictureFiles, ReportFiles
 from scanloom.schemas.loops import Loops, Places
 from scanloom.schemas.pose_graph import Graph
@@ -15,6 +16,7 @@ from scanloom.schemas.tracks import Gnss, Imu, Wheel
 from scanloom.schemas.trajectory import Odometry, Poses, Truth
 from scanloom.schemas.windows import Track, TrackEnds, Window
 from scanloom.stages.base import base
+from scanloom.stages.changes import changes
 from scanloom.stages.denoise import denoise
 from scanloom.stages.deskew import deskew
 from scanloom.stages.evaluation import evaluation
@@ -50,6 +52,7 @@ NODES: tuple[Node, ...] = (
     node("loops",      loops,      per="map",     reads=(Deskewed, Labels, Odometry, Places),  writes=Loops),
     node("fusion",     fusion,     per="map",     reads=(Session, Odometry, Loops, Gnss, Imu, Wheel, SensorCheck, Base), writes=(Poses, Graph)),
     node("tiling",     tiling,     per="chunk",   reads=(Deskewed, Labels, Poses),             writes=Piece),
+    node("changes",    changes,    per="map",     reads=(Base, Poses, Deskewed, Labels, Piece), writes=(Changes, ChangeFiles)),
     node("tiles",      tiles,      per="tile",    reads=(Piece,),                              writes=(Tile, TileFiles)),
     node("overview",   overview,   per="map",     reads=(Tile,),                               writes=(TileIndex, MapFiles)),
     node("evaluation", evaluation, per="map",     reads=(Session, Truth, Odometry, Poses, Loops, Graph, Gnss, Tile, SensorCheck), writes=(Metrics, ErrorTrack)),

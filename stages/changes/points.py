@@ -1,0 +1,38 @@
+"""The points of the old map that are asked: what stands about, one per voxel, tile by tile."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from scanloom.schemas.tiles import Piece
+from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.voxels import downsample
+
+
+def standing_points(tile: str, pieces: Sequence[Piece], thinning_m: float) -> F8:
+    """Points (n, 3) of the map's frame that the pieces of a tile hold and that are no ground, thinned."""
+    voxel = np.concatenate([piece.voxel for piece in pieces])
+    order = np.argsort(voxel, kind="stable")
+    starts = np.flatnonzero(np.diff(voxel[order], prepend=-1))
+
+    def total(name: str) -> F8:
+        values = np.concatenate([getattr(piece, name) for piece in pieces]).astype(np.float64)
+        return np.asarray(np.add.reduceat(values[order], starts))
+
+    if not len(voxel):
+        return np.empty((0, 3))
+    count = total("count")
+    standing = 2.0 * total("ground_count") <= count
+    size = pieces[0].tile_size_m
+    corner = np.array([*corner_of(tile, size), 0.0])
+    sums = np.column_stack([total(f"sum_{axis}_m") for axis in "xyz"])
+    points = (sums / count[:, None] + corner)[standing]
+    return np.ascontiguousarray(points[downsample(points - corner, thinning_m)])
+
+
+def corner_of(tile: str, size_m: float) -> tuple[float, float]:
+    """Lower corner of a tile named `X_Y`, m."""
+    x, y = tile.split("_")
+    return int(x) * size_m, int(y) * size_m
