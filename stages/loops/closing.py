@@ -108,9 +108,9 @@ def _table(
         inlier_ratio=np.array([v.inlier_ratio for v in verdicts], float),
         rmse_m=np.array([v.rmse_m for v in verdicts], float),
         overlap=np.array([v.overlap for v in verdicts], float),
-        seen_through=np.full(len(found), np.nan),
-        e1_m=np.full(len(found), np.nan),
-        rival=np.full(len(found), np.nan),
+        seen_through=np.array([v.seen_through for v in verdicts], float),
+        e1_m=np.array([v.e1_m for v in verdicts], float),
+        rival=np.array([v.rival for v in verdicts], float),
         accepted=np.array([not r for r in reasons], np.bool_),
         reason=np.array([r or "passed every test" for r in reasons], object),
     )
