@@ -16,8 +16,8 @@ from scanloom.stages.fusion.settings import Settings
 from scanloom.stages.fusion.wheel import NO_MOTIONS, Odometer
 from scanloom.stages.geometry.se3 import F8, inverse, pose
 
-UNSEEN_STD_M = 10.0
-"""Of odometry along directions that no scan saw (methods 1.8): there the wheels decide, and GNSS."""
+UNSEEN_STD = np.repeat([np.radians(10.0), 10.0], 3)
+"""Of odometry along directions that no scan saw, rad and m (methods 1.8): there gyro and wheels decide, and GNSS."""
 
 
 def assembled(
@@ -65,7 +65,7 @@ def _step_covariance(settings: Settings, d: Drive, by_wheels: I8) -> F8:
     covariance = d.step_covariance().copy()
     last = np.searchsorted(d.keyframes, np.arange(len(d.odometry)))
     told = np.isin(last - 1, by_wheels)
-    covariance[told, 3:, 3:] += UNSEEN_STD_M**2 * d.unseen_translation()[told]
+    covariance[told] += UNSEEN_STD[:, None] * d.unseen()[told] * UNSEEN_STD
     return covariance
 
 

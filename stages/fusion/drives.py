@@ -148,11 +148,15 @@ class Drive:
         """Covariances (n, 6, 6) of the motion to each scan as odometry states them; a wide guess where it does not."""
         return trusted(self.odometry.covariance)
 
-    def unseen_translation(self) -> F8:
-        """(n, 3, 3): sum of u u^T over the directions u of translation that a scan did not see, in the LiDAR frame."""
-        weak = self.odometry.direction_p < SEEN_P
-        u = self.odometry.weak_directions[:, 3:, :] * weak[:, None, :]
-        return np.asarray(u @ np.swapaxes(u, 1, 2))
+    def unseen(self) -> F8:
+        """(n, 6, 6): sum of u u^T over the directions u that a scan did not see, rotation and translation apart.
+
+        Odometry's directions are those of the scaled tangent, where both parts are metres.
+        """
+        u = self.odometry.weak_directions * (self.odometry.direction_p < SEEN_P)[:, None, :]
+        out = u @ np.swapaxes(u, 1, 2)
+        out[:, :3, 3:] = out[:, 3:, :3] = 0.0
+        return np.asarray(out)
 
 
 def trusted(covariance: F8) -> F8:
