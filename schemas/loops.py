@@ -13,16 +13,27 @@ from scanloom.schemas.product import Table, attribute, column
 
 @dataclass(frozen=True)
 class Places(Table):
-    """One row per keyframe: its descriptor."""
+    """One row per keyframe: what it looks like. Heights are those of the highest point per ring and sector, row by row.
+
+    The ones from beside have the middle of the rings a lane to the left and a lane to the right of the LiDAR.
+    """
 
     NAME: ClassVar[str] = "places"
+    SCHEMA_VERSION: ClassVar[int] = 2
 
     scan_index: NDArray[np.int64] = column("i8", "number of the keyframe's scan in its session")
     stamp_ns: NDArray[np.int64] = column("i8", "reference time of the scan", unit="ns")
-    descriptor: NDArray[np.float32] = column(
-        "f4", "scan context: highest point per ring and sector, row by row", unit="m", shape=(20, 60)
+    descriptor: NDArray[np.float32] = column("f4", "scan context", unit="m", shape=(20, 60))
+    beside: NDArray[np.float32] = column("f4", "the same from beside", unit="m", shape=(2, 20, 60))
+    segment_descriptor: NDArray[np.float32] = column(
+        "f4",
+        "scan context of segments alone: without ground and what is no structure",
+        unit="m",
+        shape=(20, 60),
     )
+    segment_beside: NDArray[np.float32] = column("f4", "the same from beside", unit="m", shape=(2, 20, 60))
     max_radius_m: float = attribute("radius of the outermost ring, m")
+    lane_m: float = attribute("how far beside the LiDAR the middle of the rings is, m")
 
 
 @dataclass(frozen=True)

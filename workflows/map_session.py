@@ -48,7 +48,7 @@ NODES: tuple[Node, ...] = (
     node("windows",    windows,    per="session", reads=(Scans,),                              writes=Window, settings="odometry"),
     node("track",      track,      per="window",  reads=(Window, Deskewed, Labels, Session, Imu, Wheel, SensorCheck), writes=(Track, TrackEnds), settings="odometry"),
     node("odometry",   odometry,   per="session", reads=(Deskewed, Labels, Session, Imu, Wheel, SensorCheck, Track, TrackEnds), writes=Odometry),
-    node("places",     places,     per="session", reads=(Deskewed, Labels, Odometry),          writes=Places),
+    node("places",     places,     per="chunk",   reads=(Deskewed, Labels, Odometry),          writes=Places),
     node("loops",      loops,      per="map",     reads=(Deskewed, Labels, Odometry, Places),  writes=Loops),
     node("fusion",     fusion,     per="map",     reads=(Session, Odometry, Loops, Gnss, Imu, Wheel, SensorCheck, Base), writes=(Poses, Graph)),
     node("tiling",     tiling,     per="chunk",   reads=(Deskewed, Labels, Poses),             writes=Piece),
@@ -56,7 +56,7 @@ NODES: tuple[Node, ...] = (
     node("tiles",      tiles,      per="tile",    reads=(Piece,),                              writes=(Tile, TileFiles)),
     node("overview",   overview,   per="map",     reads=(Tile,),                               writes=(TileIndex, MapFiles)),
     node("evaluation", evaluation, per="map",     reads=(Session, Truth, Odometry, Poses, Loops, Graph, Gnss, Tile, SensorCheck), writes=(Metrics, ErrorTrack)),
-    node("picture",    picture,    per="map",     reads=(Session, Poses, Loops, TileIndex, Tile, Gnss), writes=PictureFiles),
-    node("report",     report,     per="map",     reads=(Session, Metrics, ErrorTrack, Poses, Loops, TileIndex, PictureFiles, Gnss, SensorCheck), writes=ReportFiles),
+    node("picture",    picture,    per="map",     reads=(Poses, Loops, Graph, TileIndex, Tile), writes=PictureFiles),
+    node("report",     report,     per="map",     reads=(Session, Metrics, ErrorTrack, Odometry, Poses, Loops, Graph, TileIndex, PictureFiles, SensorCheck), writes=ReportFiles),
 )
 # fmt: on

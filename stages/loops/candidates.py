@@ -1,13 +1,10 @@
-"""Loop candidates: keyframes that may show the same place, by descriptor and by odometry's position.
-
-The descriptor search is two-stage as in Scan Context: ring keys (rotation invariant) pick neighbours, then the
-column-shifted cosine distance tells how alike they are and from which heading.
-"""
+"""Loop candidates: keyframes that may show the same place, by their looks and by odometry's position."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +13,15 @@ from pydantic import BaseModel, ConfigDict, Field
 from scanloom.schemas.errors import StageError
 from scanloom.schemas.loops import Places
 from scanloom.schemas.trajectory import Odometry
-from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8, inverse
+from scanloom.stages.loops.position import PositionSettings, accumulated, nearest_earlier
+from scanloom.stages.loops.scan_context import F4, contexts
+from scanloom.stages.loops.search import Looks, SearchSettings, search
 
 I8 = NDArray[np.int64]
-F4 = NDArray[np.float32]
+Source = Literal["position", "temporal", "segments"]
 
-LEAST_COMMON_COLUMNS = 12
-BESIDE_M = np.array([-4.0, -2.0, 2.0, 4.0])
-NEIGHBOURHOOD_MARGIN = 0.05
-TAU = 2 * np.pi
+LEAST_CANDIDATES = 20
 
 
 class CandidateSettings(BaseModel):
@@ -40,17 +36,10 @@ class CandidateSettings(BaseModel):
         default=30.0, ge=0, le=1e4, description="time between two passes of one session, at least, s"
     )
     query_spacing_m: float = Field(default=2.0, gt=0, le=100, description="one search per this much path, m")
-    neighbours: int = Field(default=10, ge=1, le=100, description="ring keys compared in full per search")
-    max_descriptor_distance: float = Field(
-        default=0.45, gt=0, le=1, description="less alike places are no candidates"
+    search: SearchSettings = Field(default_factory=SearchSettings, description="search by looks")
+    position: PositionSettings = Field(
+        default_factory=PositionSettings, description="search by odometry's position"
     )
-    radius_m: float = Field(
-        default=12.0, gt=0, le=200, description="odometry positions closer than this are candidates, m"
-    )
-    radius_growth: float = Field(
-        default=0.02, ge=0, le=0.5, description="growth of that radius per metre driven in between"
-    )
-    max_radius_m: float = Field(default=30.0, gt=0, le=500, description="largest such radius, m")
     spacing_m: float = Field(
         default=10.0, gt=0, le=1000, description="no two candidates are closer than this on both passes, m"
     )
@@ -74,7 +63,9 @@ class Track:
     stamp_ns: I8
     T_odom_lidar: F8
     travelled_m: F8
-    descriptor: F4
+    spread: F8
+    """(n, 6, 6) covariance of all motions so far, from `position.accumulated`."""
+    looks: Looks
 
     def __len__(self) -> int:
         return len(self.scan_index)
@@ -96,6 +87,10 @@ class Candidate:
     """T_i_j by odometry; None between sessions."""
     score: float
     """Smaller is more promising."""
+    source: Source = "position"
+    temporal_distance: float = float("nan")
+    segment_distance: float = float("nan")
+    """NaN where it was not asked."""
 
 
 def tracks_of(name: str, odometry: Odometry, places: Places) -> list[Track]:
@@ -116,6 +111,7 @@ def tracks_of(name: str, odometry: Odometry, places: Places) -> list[Track]:
     rows = np.array([row[int(s)] for s in places.scan_index], np.int64)
     step = np.linalg.norm(np.diff(odometry.T_odom_lidar[:, :3, 3], axis=0), axis=1)
     travelled = np.concatenate(([0.0], np.cumsum(step)))[: len(odometry)]
+    spread = accumulated(odometry)
     parts = [np.flatnonzero(odometry.segment[rows] == s) for s in np.unique(odometry.segment[rows])]
     return [
         Track(
@@ -124,18 +120,36 @@ def tracks_of(name: str, odometry: Odometry, places: Places) -> list[Track]:
             odometry.stamp_ns[rows[part]],
             odometry.T_odom_lidar[rows[part]],
             travelled[rows[part]],
-            places.descriptor[part],
+            spread[rows[part]],
+            looks_of(
+                places.descriptor[part],
+                places.beside[part],
+                places.segment_descriptor[part],
+                places.segment_beside[part],
+            ),
         )
         for part in parts or [np.zeros(0, np.int64)]
     ]
 
 
+def looks_of(descriptor: F4, beside: F4, segment_descriptor: F4, segment_beside: F4) -> Looks:
+    """Descriptors (n, 20, 60), and (n, 2, 20, 60) from beside, ready to be compared."""
+
+    def views(straight: F4, aside: F4) -> tuple[F4, F4, F4]:
+        return straight, aside[:, 0], aside[:, 1]
+
+    return Looks(
+        tuple(contexts(d) for d in views(descriptor, beside)),
+        tuple(contexts(d) for d in views(segment_descriptor, segment_beside)),
+    )
+
+
 def candidates(settings: CandidateSettings, tracks: Sequence[Track]) -> list[Candidate]:
     """The most promising candidates of all sessions, thinned along the tracks, best first."""
-    found = _by_position(settings, tracks) + _by_descriptor(settings, tracks)
+    found = [*_by_position(settings, tracks), *_by_looks(settings, tracks)]
     found.sort(key=lambda c: (c.score, c.b, c.j, c.a, c.i))
     driven_m = sum(float(t.travelled_m[-1] - t.travelled_m[0]) for t in tracks if len(t))
-    most = max(20, int(settings.per_km * driven_m / 1000.0))
+    most = max(LEAST_CANDIDATES, int(settings.per_km * driven_m / 1000.0))
     kept: list[Candidate] = []
     taken: dict[tuple[int, int, int, int], list[tuple[float, float]]] = {}
     for c in found:
@@ -161,166 +175,62 @@ def _crowded(
     return False
 
 
-def _queries(track: Track, spacing_m: float) -> I8:
+def queries_of(travelled_m: F8, spacing_m: float) -> I8:
     """The first keyframe of every stretch of path."""
-    return np.unique(np.floor(track.travelled_m / spacing_m), return_index=True)[1].astype(np.int64)
+    return np.unique(np.floor(travelled_m / spacing_m), return_index=True)[1].astype(np.int64)
 
 
-def _ordered(
-    tracks: Sequence[Track], a: int, i: int, b: int, j: int, distance: float, yaw: float, score: float
-) -> Candidate:  # fmt: skip
-    """A candidate with its earlier scan first; `yaw` is the heading of (b, j) in (a, i)."""
-    if tracks[a].stamp_ns[i] > tracks[b].stamp_ns[j]:
-        a, i, b, j, yaw = b, j, a, i, -yaw
-    predicted = inverse(tracks[a].T_odom_lidar[i]) @ tracks[b].T_odom_lidar[j] if a == b else None
-    return Candidate(a, i, b, j, distance, yaw, predicted, score)
+def admitted_before(travelled_m: F8, stamp_ns: I8, queries: I8, min_path_m: float, min_time_s: float) -> I8:
+    """How many of the first keyframes were left long enough before each of the keyframes `queries`."""
+    by_path = np.searchsorted(travelled_m, travelled_m[queries] - min_path_m, side="right")
+    by_time = np.searchsorted(stamp_ns, stamp_ns[queries] - int(min_time_s * 1e9), side="right")
+    return np.minimum(by_path, by_time).astype(np.int64)
 
 
-# --------------------------------------------------------------------------------------------------------- by position
+def _asked(settings: CandidateSettings, track: Track) -> tuple[I8, I8]:
+    """Keyframes of a track that are searched for, and how many of its first each may match."""
+    queries = queries_of(track.travelled_m, settings.query_spacing_m)
+    return queries, admitted_before(
+        track.travelled_m, track.stamp_ns, queries, settings.min_path_m, settings.min_time_s
+    )
 
 
-def _by_position(settings: CandidateSettings, tracks: Sequence[Track]) -> list[Candidate]:
-    """For each search position, the nearest earlier keyframe of the same session within a radius that grows with path."""
-    found = []
+def _by_position(settings: CandidateSettings, tracks: Sequence[Track]) -> Iterator[Candidate]:
+    """For each search position, the nearest earlier keyframe of the same track."""
     for number, track in enumerate(tracks):
-        position = track.T_odom_lidar[:, :3, 3]
-        for j in _queries(track, settings.query_spacing_m):
-            apart = track.travelled_m[j] - track.travelled_m[:j]
-            radius = np.minimum(settings.radius_m + settings.radius_growth * apart, settings.max_radius_m)
-            distance = np.linalg.norm(position[:j, :2] - position[j, :2], axis=1)
-            old = (apart >= settings.min_path_m) & (
-                track.stamp_ns[j] - track.stamp_ns[:j] >= settings.min_time_s * 1e9
-            )
-            share = np.where(old & (distance < radius), distance / np.maximum(radius, 1e-9), np.inf)
-            if len(share) and np.isfinite(share.min()):
-                found.append(
-                    _ordered(
-                        tracks,
-                        number,
-                        int(np.argmin(share)),
-                        number,
-                        int(j),
-                        np.nan,
-                        np.nan,
-                        float(share.min()),
-                    )
-                )
-    return found
+        queries, admitted = _asked(settings, track)
+        place, share = nearest_earlier(
+            settings.position,
+            track.T_odom_lidar[:, :3, 3],
+            track.spread,
+            track.travelled_m,
+            queries,
+            admitted,
+        )
+        for k in np.flatnonzero(place >= 0):
+            i, j = int(place[k]), int(queries[k])
+            predicted = inverse(track.T_odom_lidar[i]) @ track.T_odom_lidar[j]
+            yield Candidate(number, i, number, j, float("nan"), float("nan"), predicted, float(share[k]))
 
 
-# ------------------------------------------------------------------------------------------------------- by descriptor
-
-
-def _by_descriptor(settings: CandidateSettings, tracks: Sequence[Track]) -> list[Candidate]:
-    """For each search position, the most alike earlier keyframe of each session."""
-    found = []
-    units = [_unit_columns(t.descriptor) for t in tracks]
-    keys = [t.descriptor.mean(axis=2) for t in tracks]
+def _by_looks(settings: CandidateSettings, tracks: Sequence[Track]) -> Iterator[Candidate]:
+    """For each search position, the most alike earlier keyframe of each track."""
     for b, track in enumerate(tracks):
-        queries = _queries(track, settings.query_spacing_m)
+        queries, admitted = _asked(settings, track)
         for a in range(b + 1):
-            if not len(tracks[a]):
-                continue
-            best, distance, shift = _search(
-                keys[a], units[a], tracks[a].stamp_ns, tracks[a].travelled_m, keys[b], units[b], track.stamp_ns,
-                track.travelled_m, queries, a == b, settings.min_path_m, int(settings.min_time_s * 1e9),
-                settings.neighbours,
+            whole = np.full(len(queries), len(tracks[a]), np.int64)
+            found = search(
+                settings.search, tracks[a].looks, track.looks, tracks[a].travelled_m, track.travelled_m, queries,
+                admitted if a == b else whole,
             )  # fmt: skip
-            for k in np.flatnonzero((best >= 0) & (distance <= settings.max_descriptor_distance)):
-                i, j = int(best[k]), int(queries[k])
-                around = _neighbourhood_distance(units[a], units[b], _beside(tracks[a], i), _beside(track, j))
-                if around > settings.max_descriptor_distance + NEIGHBOURHOOD_MARGIN:
-                    continue
-                yaw = float((shift[k] / track.descriptor.shape[2] * TAU + np.pi) % TAU - np.pi)
-                score = 0.5 * (float(distance[k]) + around) / settings.max_descriptor_distance
-                found.append(_ordered(tracks, a, i, b, j, float(distance[k]), yaw, score))
-    return found
-
-
-def _beside(track: Track, k: int) -> I8:
-    """Keyframes (4,) nearest to 4 and 2 m before and 2 and 4 m after keyframe k."""
-    wanted = track.travelled_m[k] + BESIDE_M
-    after = np.clip(np.searchsorted(track.travelled_m, wanted), 0, len(track) - 1)
-    return np.asarray(after, np.int64)
-
-
-def _neighbourhood_distance(units_a: F4, units_b: F4, beside_i: I8, beside_j: I8) -> float:
-    """Mean distance of the neighbours of i and j, driven in the same or in the opposite direction (STV-SC's temporal check).
-
-    A place that looks alike by accident has neighbours that do not.
-    """
-    same = [_distance(units_a[i], units_b[j])[0] for i, j in zip(beside_i, beside_j, strict=True)]
-    opposite = [_distance(units_a[i], units_b[j])[0] for i, j in zip(beside_i[::-1], beside_j, strict=True)]
-    return float(min(np.mean(same), np.mean(opposite)))
-
-
-def _unit_columns(descriptor: F4) -> F4:
-    """Descriptors as (n, sectors, rings) with columns of length 1, or 0 where empty."""
-    columns = np.ascontiguousarray(np.swapaxes(descriptor, 1, 2))
-    length = np.linalg.norm(columns, axis=2, keepdims=True)
-    return np.asarray(np.where(length > 0, columns / np.maximum(length, 1e-9), 0), np.float32)
-
-
-def descriptor_distance(descriptor_i: F4, descriptor_j: F4) -> tuple[float, float]:
-    """Scan context distance (0 same, 1 different) and the heading of j in i, rad, of two descriptors (20, 60)."""
-    u = _unit_columns(np.stack((descriptor_i, descriptor_j)))
-    distance, shift = _distance(u[0], u[1])
-    return float(distance), float((shift / descriptor_i.shape[1] * TAU + np.pi) % TAU - np.pi)
-
-
-@kernel
-def _search(
-    keys_a: F4, units_a: F4, stamp_a: I8, path_a: F8, keys_b: F4, units_b: F4, stamp_b: I8, path_b: F8, queries: I8,
-    same: bool, min_path: float, min_ns: int, neighbours: int,
-) -> tuple[I8, F8, I8]:  # fmt: skip
-    best = np.full(len(queries), -1, np.int64)
-    distance = np.ones(len(queries))
-    shift = np.zeros(len(queries), np.int64)
-    near = np.empty(neighbours, np.int64)
-    near_d = np.empty(neighbours)
-    for q in range(len(queries)):
-        j = queries[q]
-        count = 0
-        for i in range(len(keys_a)):
-            if same and (path_b[j] - path_a[i] < min_path or stamp_b[j] - stamp_a[i] < min_ns):
-                continue
-            d = 0.0
-            for r in range(keys_a.shape[1]):
-                e = float(keys_a[i, r] - keys_b[j, r])
-                d += e * e
-            if count == neighbours and d >= near_d[count - 1]:
-                continue
-            at = count if count < neighbours else neighbours - 1
-            while at > 0 and near_d[at - 1] > d:
-                near_d[at], near[at] = near_d[at - 1], near[at - 1]
-                at -= 1
-            near_d[at], near[at] = d, i
-            count = min(count + 1, neighbours)
-        for k in range(count):
-            d, s = _distance(units_a[near[k]], units_b[j])
-            if d < distance[q]:
-                best[q], distance[q], shift[q] = near[k], d, s
-    return best, distance, shift
-
-
-@kernel
-def _distance(unit_i: F4, unit_j: F4) -> tuple[float, int]:
-    """Smallest mean cosine distance over column shifts; column s of i faces column s - shift of j."""
-    sectors, rings = unit_i.shape
-    best, best_shift = 1.0, 0
-    for shift in range(sectors):
-        common = 0
-        total = 0.0
-        for s in range(sectors):
-            t = s - shift
-            if t < 0:
-                t += sectors
-            dot = 0.0
-            for r in range(rings):
-                dot += unit_i[s, r] * unit_j[t, r]
-            if dot > 0.0:
-                common += 1
-                total += dot
-        if common >= LEAST_COMMON_COLUMNS and 1.0 - total / common < best:
-            best, best_shift = 1.0 - total / common, shift
-    return best, best_shift
+            for k in np.flatnonzero(found.score <= settings.search.max_distance):
+                i, j, yaw = int(found.place[k]), int(queries[k]), found.heading(int(k))
+                first, second = (a, i), (b, j)
+                if tracks[a].stamp_ns[i] > track.stamp_ns[j]:
+                    first, second, yaw = second, first, -yaw
+                predicted = inverse(track.T_odom_lidar[i]) @ track.T_odom_lidar[j] if a == b else None
+                yield Candidate(
+                    *first, *second, float(found.distance[k]), yaw, predicted,
+                    float(found.score[k]) / settings.search.max_distance, found.source(int(k)),
+                    float(found.temporal[k]), float(found.segment[k]),
+                )  # fmt: skip

@@ -14,7 +14,7 @@ from scanloom.schemas.scans import Deskewed, Labels
 from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.loops.candidates import Candidate, CandidateSettings, Track, candidates, tracks_of
 from scanloom.stages.loops.consistency import ConsistencySettings, inconsistent
-from scanloom.stages.loops.reading import ScanShelf
+from scanloom.stages.loops.reading import ScanShelf, joined
 from scanloom.stages.loops.submaps import SubmapSettings, SubmapShelf
 from scanloom.stages.loops.verification import Verdict, VerificationSettings, verify
 
@@ -67,7 +67,7 @@ def _tracks(
     deskewed: Parts[Deskewed], labels: Parts[Labels], odometry: Parts[Odometry], places: Parts[Places]
 ) -> tuple[list[Track], list[ScanShelf]]:
     clouds, classes = deskewed.by("session"), labels.by("session")
-    described = {where["session"]: part for where, part in places.items()}
+    described = {name: joined(list(chunks)) for name, chunks in places.by("session").items()}
     tracks, shelves = [], []
     for where, track in odometry.items():
         name = where["session"]
@@ -99,12 +99,10 @@ def _table(
         scan_j=np.array([tracks[c.b].scan_index[c.j] for c in found], np.int64),
         T_i_j=np.array([v.T_i_j for v in verdicts], float).reshape(-1, 4, 4),
         covariance=np.array([v.covariance for v in verdicts], float).reshape(-1, 6, 6),
-        source=np.array(
-            ["temporal" if np.isfinite(c.descriptor_distance) else "position" for c in found], object
-        ),
+        source=np.array([c.source for c in found], object),
         descriptor_distance=np.array([c.descriptor_distance for c in found], float),
-        temporal_distance=np.full(len(found), np.nan),
-        segment_distance=np.full(len(found), np.nan),
+        temporal_distance=np.array([c.temporal_distance for c in found], float),
+        segment_distance=np.array([c.segment_distance for c in found], float),
         inlier_ratio=np.array([v.inlier_ratio for v in verdicts], float),
         rmse_m=np.array([v.rmse_m for v in verdicts], float),
         overlap=np.array([v.overlap for v in verdicts], float),

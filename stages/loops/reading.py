@@ -2,26 +2,40 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Collection, Iterator, Sequence
+from typing import Any
+
+import numpy as np
 
 from scanloom.schemas.errors import StageError
-from scanloom.schemas.product import Parts
+from scanloom.schemas.loops import Places
+from scanloom.schemas.product import Parts, columns_of
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, ScanLabels
 
 
 def keyframe_scans(
-    deskewed: Parts[Deskewed], labels: Parts[Labels], wanted: Collection[int]
+    deskewed: Deskewed, labels: Labels, wanted: Collection[int]
 ) -> Iterator[tuple[DeskewedScan, ScanLabels]]:
-    """Scans of one session whose number is in `wanted`, in sequence, with their labels; others are not read.
+    """Scans of one chunk whose number is in `wanted`, in sequence, with their labels; others are not read.
 
     Raises
     ------
     StageError : labels do not fit the scans.
     """
-    for cloud, classes in _chunks(deskewed, labels):
-        for place, entry in enumerate(cloud.index):
-            if entry["scan_index"] in wanted:
-                yield _pair(cloud, classes, place)
+    for place, entry in enumerate(deskewed.index):
+        if entry["scan_index"] in wanted:
+            yield _pair(deskewed, labels, place)
+
+
+def joined(chunks: Sequence[Places]) -> Places:
+    """The places of all chunks of a session as one table, in sequence."""
+    if len(chunks) == 1:
+        return chunks[0]
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(c, name) for c in chunks]) for name in columns_of(Places)
+    }
+    return dataclasses.replace(chunks[0], **columns)
 
 
 class ScanShelf:

@@ -14,11 +14,11 @@ from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels
 from scanloom.stages.geometry.se3 import F8, inverse, se3_log
 from scanloom.stages.loops.closing import Settings, loops
 from scanloom.stages.loops.places import Settings as PlaceSettings
-from scanloom.stages.loops.places import places
 from tests.stages.loops.worlds import (
     START_NS,
     block,
     chunks,
+    described,
     labels_of,
     odometry_of,
     one,
@@ -48,8 +48,8 @@ def close(
         late = odometry.stamp_ns > START_NS + MINUTE_NS - 1
         odometry.T_odom_lidar[late] = drift @ odometry.T_odom_lidar[late]
     clouds, classes = chunks(Deskewed, scans), chunks(Labels, labels)
-    described = places(PlaceSettings(), clouds, classes, odometry)
-    return loops(Settings(), clouds, classes, one(odometry), one(described))
+    seen = described(PlaceSettings(), clouds, classes, odometry)
+    return loops(Settings(), clouds, classes, one(odometry), seen)
 
 
 def errors(found: Loops, T: F8) -> tuple[F8, F8]:
@@ -156,7 +156,7 @@ def test_a_street_that_repeats_itself_is_ambiguous() -> None:
 def test_other_sessions_are_searched_by_looks() -> None:
     world = block(1)
     T_a, T_b = polyline([(SIDE, 24), (SIDE, -24)]), polyline([(SIDE + 2.5, -20), (SIDE + 2.5, 20)])
-    clouds, classes, tracks, described = [], [], [], []
+    clouds, classes, tracks, seen = [], [], [], []
     for name, T, start in (("a", T_a, START_NS), ("b", T_b, START_NS - 30 * MINUTE_NS)):
         scans = scans_of(world, T, seed=len(clouds), start_ns=start)
         labels, odometry = labels_of(scans, T), odometry_of(T, scans)
@@ -164,10 +164,9 @@ def test_other_sessions_are_searched_by_looks() -> None:
         clouds.append(cloud)
         classes.append(label)
         tracks.append(one(odometry, name))
-        described.append(one(places(PlaceSettings(), cloud, label, odometry), name))
+        seen.append(described(PlaceSettings(), cloud, label, odometry, name))
     joined = [
-        Parts([pair for part in group for pair in part._parts])
-        for group in (clouds, classes, tracks, described)
+        Parts([pair for part in group for pair in part._parts]) for group in (clouds, classes, tracks, seen)
     ]
     found = loops(Settings(), *joined)
     assert set(found.session_i[found.accepted]) == {"b"}
@@ -183,9 +182,9 @@ def test_a_short_drive_has_no_candidates_and_mixed_inputs_are_an_error() -> None
     scans = scans_of(block(1), T)
     labels, odometry = labels_of(scans, T), odometry_of(T, scans)
     clouds, classes = chunks(Deskewed, scans), chunks(Labels, labels)
-    described = places(PlaceSettings(), clouds, classes, odometry)
-    assert len(loops(Settings(), clouds, classes, one(odometry), one(described))) == 0
+    seen = described(PlaceSettings(), clouds, classes, odometry)
+    assert len(loops(Settings(), clouds, classes, one(odometry), seen)) == 0
     with pytest.raises(StageError, match="session a"):
-        loops(Settings(), clouds, classes, one(odometry), one(described, "b"))
+        loops(Settings(), clouds, classes, one(odometry), one(seen[0], "b"))
     with pytest.raises(StageError, match="odometry"):
-        loops(Settings(), clouds, classes, one(odometry.take(slice(0, 3))), one(described))
+        loops(Settings(), clouds, classes, one(odometry.take(slice(0, 3))), seen)

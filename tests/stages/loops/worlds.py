@@ -10,6 +10,7 @@ from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
 from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.geometry.se3 import inverse, pose, se3_exp, so3_exp
+from scanloom.stages.loops.places import Settings, places
 from tests.worlds import GROUND_Z_M, BoxWorld, observe
 
 START_NS = 1_700_000_000_000_000_000
@@ -126,6 +127,18 @@ def chunks(kind: type[Deskewed] | type[Labels], items: list, size: int = 50, ses
         [
             ((("session", session), ("chunk", f"{k:04d}")), kind(items[k * size : (k + 1) * size]))
             for k in range(-(-len(items) // size))
+        ]
+    )
+
+
+def described(
+    settings: Settings, clouds: Parts, classes: Parts, odometry: Odometry, session: str = "a"
+) -> Parts:
+    """Places of all chunks."""
+    return Parts(
+        [
+            ((("session", session), ("chunk", f"{k:04d}")), places(settings, cloud, label, odometry))
+            for k, (cloud, label) in enumerate(zip(clouds, classes, strict=True))
         ]
     )
 
