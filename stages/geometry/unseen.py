@@ -16,16 +16,23 @@ KINDS = ("along", "across", "up", "turn")
 
 def unseen(odometry: Odometry) -> NDArray[np.bool_]:
     """Scans (n,) whose registration did not see some direction."""
-    return np.asarray((odometry.direction_p < SEEN_P).any(axis=1))
+    return np.asarray(_weak(odometry).any(axis=1))
 
 
 def unseen_kinds(odometry: Odometry, R_base_lidar: F8) -> NDArray[np.bool_]:
     """Which `KINDS` (n, 4) each scan did not see; a direction between two counts for the nearer one."""
-    weak = odometry.direction_p < SEEN_P
+    weak = _weak(odometry)
     rotation = np.linalg.norm(odometry.weak_directions[:, :3], axis=1)
     shift = np.abs(R_base_lidar @ odometry.weak_directions[:, 3:])
     kind = np.where(rotation > np.linalg.norm(shift, axis=1), 3, shift.argmax(axis=1))
     return np.stack([(weak & (kind == k)).any(axis=1) for k in range(len(KINDS))], axis=1)
+
+
+def _weak(odometry: Odometry) -> NDArray[np.bool_]:
+    """Directions (n, 6) that were not seen; the first scan of a segment has no motion to be seen."""
+    weak = np.asarray(odometry.direction_p < SEEN_P)
+    first = np.diff(odometry.segment, prepend=-1) != 0
+    return np.asarray(weak & ~first[:, None])
 
 
 def stretches(marked: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -11,12 +11,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from scanloom.schemas.evaluation import PictureFiles
 from scanloom.schemas.loops import Loops
+from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.product import Parts
-from scanloom.schemas.session import Session
 from scanloom.schemas.tiles import Tile, TileIndex
-from scanloom.schemas.tracks import Gnss
 from scanloom.schemas.trajectory import Poses
-from scanloom.stages.report.gnss_agreement import gnss_agreements
 from scanloom.stages.report.marks import map_marks
 from scanloom.stages.report.overlay import Mark, paint, scale_bar, to_svg
 from scanloom.stages.report.raster import View, draw_map, fit_view
@@ -39,20 +37,17 @@ class Settings(BaseModel):
 
 def picture(
     settings: Settings,
-    session: Parts[Session],
     poses: Parts[Poses],
     loops: Loops,
+    graph: Graph,
     tile_index: TileIndex,
     tiles: Parts[Tile],
-    gnss: Parts[Gnss],
 ) -> PictureFiles:
     """Draw the map, tile by tile, and what lies on it."""
-    sessions = {c["session"]: s for c, s in session.items()}
     paths = {c["session"]: p for c, p in poses.items()}
     view = _view(settings, paths, tile_index)
     plain, view = _enlarge(draw_map(tiles, view), view, settings.longest_px)
-    fixes = {name: found.fixes for name, found in gnss_agreements(sessions, paths, gnss).items()}
-    marks: list[Mark] = map_marks(view, paths, loops, fixes) + scale_bar(view)
+    marks: list[Mark] = map_marks(view, paths, loops, graph) + scale_bar(view)
     return PictureFiles(
         contents={
             PREVIEW: _encoded(paint(plain, marks), "PNG", compress_level=3),

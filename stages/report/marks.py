@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.schemas.loops import Loops
+from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.trajectory import Poses
+from scanloom.stages.geometry.factor_rows import USED, fix_rows, loop_verdicts
+from scanloom.stages.report.loop_graph import loop_ends
 from scanloom.stages.report.overlay import (
     GNSS_COLOUR,
     INK,
@@ -23,16 +28,24 @@ _MAX_PATH_POINTS = 4000
 _MAX_FIXES = 1500
 
 
-def map_marks(
-    view: View, paths: dict[str, Poses], loops: Loops, fixes: dict[str, NDArray[np.float64]]
-) -> list[Mark]:
-    """GNSS below, then the trajectories from session to session, then loops."""
+def map_marks(view: View, paths: Mapping[str, Poses], loops: Loops, graph: Graph) -> list[Mark]:
+    """GNSS below, then the trajectories from session to session, then the loops in use."""
     marks: list[Mark] = []
-    for points in fixes.values():
+    for points in fix_positions(paths, graph).values():
         marks += _fixes(view, points)
     for number, poses in enumerate(paths.values()):
         marks += _path(view, poses, SESSION_COLOURS[number % len(SESSION_COLOURS)])
-    return marks + _loops(view, paths, loops)
+    used = np.flatnonzero(loop_verdicts(loops, graph) == USED)
+    return marks + _loops(view, paths, loops, used)
+
+
+def fix_positions(paths: Mapping[str, Poses], graph: Graph) -> dict[str, NDArray[np.float64]]:
+    """Positions (n, 3) of the fixes of every session whose map has a georeference, used or not, m."""
+    found = {}
+    for name, fixes in fix_rows(graph).items():
+        if name in paths and paths[name].georeference is not None:
+            found[name] = fixes.position_m[np.isfinite(fixes.position_m[:, :2]).all(axis=1)]
+    return found
 
 
 def _path(view: View, poses: Poses, colour: str) -> list[Mark]:
@@ -61,20 +74,13 @@ def _fixes(view: View, points: NDArray[np.float64]) -> list[Mark]:
     return [Dot(x, y, 0.22 * unit, GNSS_COLOUR, 0.8) for x, y in xy[seen]]
 
 
-def _loops(view: View, paths: dict[str, Poses], loops: Loops) -> list[Mark]:
+def _loops(view: View, paths: Mapping[str, Poses], loops: Loops, rows: NDArray[np.int64]) -> list[Mark]:
     unit = view_unit(view)
-    where = {
-        (name, int(scan)): T[:2, 3]
-        for name, poses in paths.items()
-        for scan, T in zip(poses.scan_index, poses.T_world_lidar)
-    }
     marks: list[Mark] = []
-    for k in np.flatnonzero(loops.accepted):
-        a = where.get((loops.session_i[k], int(loops.scan_i[k])))
-        b = where.get((loops.session_j[k], int(loops.scan_j[k])))
-        if a is None or b is None:
+    for k, ends_m in zip(rows, loop_ends(paths, loops)[rows]):
+        if not np.isfinite(ends_m).all():
             continue
-        ends = view.pixels(np.array([a, b]))
+        ends = view.pixels(ends_m)
         marks.append(Line(ends, LOOP_COLOUR, 0.25 * unit, 0.9))
         tip = f"loop: scan {loops.scan_i[k]} and {loops.scan_j[k]}, rmse {loops.rmse_m[k]:.2f} m"
         marks += [Dot(x, y, 0.32 * unit, LOOP_COLOUR, 0.9, tip) for x, y in ends]

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import base64
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from scanloom.schemas.evaluation import ErrorTrack, Metrics, PictureFiles, ReportFiles
 from scanloom.schemas.loops import Loops
-from scanloom.schemas.product import Parts
+from scanloom.schemas.pose_graph import Graph
+from scanloom.schemas.product import Parts, ProductT
 from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.session import Session
 from scanloom.schemas.tiles import TileIndex
-from scanloom.schemas.tracks import Gnss
-from scanloom.schemas.trajectory import Poses
-from scanloom.stages.report.charts import Curve, line_chart
+from scanloom.schemas.trajectory import Odometry, Poses
+from scanloom.stages.geometry.factor_rows import FixRows, fix_rows
+from scanloom.stages.report.along import blind_sessions, error_chart, fix_track
+from scanloom.stages.report.factor_table import factor_rows
 from scanloom.stages.report.figures import Figures
-from scanloom.stages.report.gnss_agreement import gnss_agreements
+from scanloom.stages.report.loop_graph import loop_graph
 from scanloom.stages.report.map_picture import OVERLAY, PLAIN
+from scanloom.stages.report.marks import fix_positions
 from scanloom.stages.report.tables import headline_cards, metric_tables, tile_rows
 from scanloom.stages.report.templates import render
 from scanloom.stages.report.verdict import Limits, judge
@@ -56,32 +60,35 @@ def report(
     session: Parts[Session],
     metrics: Metrics,
     error_track: Parts[ErrorTrack],
+    odometry: Parts[Odometry],
     poses: Parts[Poses],
     loops: Loops,
+    graph: Graph,
     tile_index: TileIndex,
     picture: PictureFiles,
-    gnss: Parts[Gnss],
     check: Parts[SensorCheck] | None = None,
 ) -> ReportFiles:
     """Judge the map and write the body of the report, to be wrapped by `page.compose`."""
-    sessions = {c["session"]: s for c, s in session.items()}
-    paths = {c["session"]: p for c, p in poses.items()}
+    sessions, paths = by_session(session), by_session(poses)
+    fixes = {name: rows for name, rows in fix_rows(graph).items() if name in paths}
     figures = Figures(metrics)
-    agreements = gnss_agreements(sessions, paths, gnss)
-    verdict = judge(_limits(settings), sessions, figures, {n: a.median_m for n, a in agreements.items()})
+    joined = loop_graph(paths, loops, graph)
     body = render(
         "body.html",
-        verdict=verdict,
+        verdict=judge(_limits(settings), sessions, figures, _gnss_medians(paths, fixes), graph),
         cards=headline_cards(sessions, figures),
         picture=_data_uri(picture.read(PLAIN)),
         overlay=picture.read(OVERLAY).decode(),
         names=list(paths),
-        loops=loops,
-        has_fixes=any(len(a.fixes) for a in agreements.values()),
-        charts=_charts(error_track),
+        has_fixes=any(len(points) for points in fix_positions(paths, graph).values()),
+        loops=joined,
+        charts={name: error_chart(track) for name, track in by_session(error_track).items()},
+        fixes={name: fix_track(rows, paths[name]) for name, rows in fixes.items()},
+        blind=blind_sessions(sessions, by_session(odometry)),
+        factors=factor_rows(graph),
         tables=metric_tables(sessions, figures),
         sessions=sessions,
-        checks={c["session"]: found for c, found in check.items()} if check is not None else {},
+        checks=by_session(check),
         tiles=tile_index,
         tile_rows=tile_rows(tile_index),
         georeference=tile_index.georeference,
@@ -89,24 +96,26 @@ def report(
     return ReportFiles(contents={"body.html": body.encode()})
 
 
+def by_session(parts: Parts[ProductT] | None) -> dict[str, ProductT]:
+    """Products by the name of their session."""
+    return {} if parts is None else {where["session"]: product for where, product in parts.items()}
+
+
+def _gnss_medians(paths: dict[str, Poses], fixes: dict[str, FixRows]) -> dict[str, float]:
+    """Median horizontal distance of the fixes to the antenna, of sessions with a georeference, m."""
+    distances = {
+        name: rows.horizontal_m[np.isfinite(rows.horizontal_m)]
+        for name, rows in fixes.items()
+        if paths[name].georeference is not None
+    }
+    return {name: float(np.median(found)) for name, found in distances.items() if len(found)}
+
+
 def _limits(settings: Settings) -> Limits:
     return Limits(
         settings.unreliable_warn, settings.unreliable_fail, settings.gnss_warn_m, settings.gnss_fail_m,
         settings.ate_warn_m, settings.drift_warn_percent, settings.open_path_warn_m,
     )  # fmt: skip
-
-
-def _charts(error_track: Parts[ErrorTrack]) -> dict[str, str]:
-    charts = {}
-    for coordinate, track in error_track.items():
-        curves = [
-            Curve(
-                "odometry, laid over truth at the first scan", track.travelled_m, track.odometry_error_m, 2
-            ),
-            Curve("map, aligned as a whole", track.travelled_m, track.fusion_error_m, 1),
-        ]
-        charts[coordinate["session"]] = line_chart(curves, "distance driven, m", "distance to truth, m")
-    return charts
 
 
 def _data_uri(jpeg: bytes) -> str:

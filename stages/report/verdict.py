@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
+from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.session import Session
 from scanloom.stages.report.figures import Figures, number
 
@@ -47,10 +48,14 @@ _WORDS: dict[Level, str] = {"fail": "Poor", "warn": "Fair", "note": "Good", "pas
 
 
 def judge(
-    limits: Limits, sessions: dict[str, Session], figures: Figures, gnss_median_m: dict[str, float | None]
+    limits: Limits,
+    sessions: dict[str, Session],
+    figures: Figures,
+    gnss_median_m: dict[str, float],
+    graph: Graph,
 ) -> Verdict:
     """Run all checks; the worst of them gives the word."""
-    checks = [*_map_checks(limits, sessions, figures)]
+    checks = [*_map_checks(limits, sessions, figures), *_graph_checks(graph)]
     for name, session in sessions.items():
         checks += _session_checks(limits, name, session, figures, gnss_median_m.get(name))
     checks.sort(key=lambda check: _ORDER[check.level])
@@ -79,6 +84,18 @@ def _map_checks(limits: Limits, sessions: Iterable[str], figures: Figures) -> It
         path_m = sum(figures.get("fusion.path_length_m", name) or 0.0 for name in sessions)
         level: Level = "warn" if path_m > limits.open_path_warn_m else "note"
         yield Check(level, "Neither GNSS nor a loop bounds the drift: accuracy falls with distance driven.")
+
+
+def _graph_checks(graph: Graph) -> Iterator[Check]:
+    """What the making of the poses has to say."""
+    for text in graph.warnings:
+        yield Check("warn", _sentence(text))
+    for text in graph.remarks:
+        yield Check("note", _sentence(text))
+
+
+def _sentence(text: str) -> str:
+    return text if text.endswith((".", "!", "?")) else f"{text}."
 
 
 def _session_checks(

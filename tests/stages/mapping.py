@@ -14,7 +14,6 @@ from scanloom.schemas.product import Part, Parts
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
 from scanloom.schemas.session import Session
 from scanloom.schemas.tiles import Piece, Tile, TileFiles
-from scanloom.schemas.tracks import Gnss
 from scanloom.schemas.trajectory import Odometry, Poses, Truth
 from scanloom.stages.geometry.se3 import F8, inverse
 from scanloom.stages.tiling import tiles, tiling
@@ -119,10 +118,6 @@ def session_of(name: str = "a", scans: int = 10, **changes: Any) -> Session:
 def one(product: Any, session: str = "a") -> Parts[Any]:
     """A product of one session, as a map stage gets it."""
     return Parts([((("session", session),), product)])
-
-
-def no_gnss() -> Gnss:
-    return Gnss.empty()
 
 
 def pieces_of(

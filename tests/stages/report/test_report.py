@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from scanloom.schemas.evaluation import ErrorTrack, Metrics, ReportFiles
-from scanloom.schemas.frames import Georeference
 from scanloom.schemas.loops import Loops
+from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.product import Parts
 from scanloom.schemas.rig import SensorCheck, WheelCheck
 from scanloom.schemas.session import Problem, Session, Topic
@@ -22,8 +22,7 @@ from scanloom.schemas.tracks import Gnss
 from scanloom.schemas.trajectory import Poses
 from scanloom.stages.evaluation import evaluation
 from scanloom.stages.evaluation.stage import Settings as EvaluationSettings
-from scanloom.stages.geometry.geodesy import georeference, world_to_geodetic
-from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.geodesy import georeference
 from scanloom.stages.report import picture, report
 from scanloom.stages.report.map_picture import Settings as PictureSettings
 from scanloom.stages.report.page import compose, fleet_page, run_section
@@ -32,15 +31,14 @@ from scanloom.stages.tiling import overview
 from scanloom.stages.tiling.overview import Settings as OverviewSettings
 from tests.stages.mapping import (
     Source,
+    fixes_graph,
     graph_of,
     loops_of,
-    no_gnss,
     odometry_of,
     one,
     pieces_of,
     poses_of,
     session_of,
-    stamps,
     tile_parts,
     tiles_of,
     truth_of,
@@ -81,7 +79,7 @@ def parse(page: str) -> Balanced:
     return parser
 
 
-DRAWN = ("session", "poses", "loops", "tile_index", "tiles", "gnss")
+DRAWN = ("poses", "loops", "graph", "tile_index", "tiles")
 
 
 class Map:
@@ -95,21 +93,20 @@ class Map:
     def report(self, **changed: Any) -> ReportFiles:
         given: dict[str, Any] = {
             "session": one(session_of(scans=5)), "metrics": None, "error_track": None, "poses": one(poses_of(self.T)),
-            "loops": Loops.empty(), "tile_index": self.index, "tiles": self.tiles, "gnss": one(no_gnss()), **changed,
+            "odometry": one(odometry_of(self.T)), "loops": Loops.empty(), "tile_index": self.index, "tiles": self.tiles,
+            **changed,
         }  # fmt: skip
+        given.setdefault("graph", graph_of(given["loops"]))
         self.drawn = picture(PictureSettings(longest_px=400), **{name: given[name] for name in DRAWN})
         if given["metrics"] is None:
             given["metrics"], given["error_track"] = self.evaluate(given)
         del given["tiles"]
         return report(Settings(), picture=self.drawn, **given)
 
-    def evaluate(
-        self, given: dict[str, Any], odometry: F8 | None = None
-    ) -> tuple[Metrics, Parts[ErrorTrack]]:
+    def evaluate(self, given: dict[str, Any]) -> tuple[Metrics, Parts[ErrorTrack]]:
         *tracks, metrics = evaluation(
             EvaluationSettings(), given["session"], one(truth_of(self.T)),
-            one(odometry_of(self.T if odometry is None else odometry)), given["poses"], given["loops"],
-            graph_of(given["loops"]), given["gnss"], given["tiles"],
+            given["odometry"], given["poses"], given["loops"], given["graph"], one(Gnss.empty()), given["tiles"],
         )  # fmt: skip
         return metrics, Parts([((("session", part.key),), part.product) for part in tracks])  # type: ignore[return-value, union-attr]
 
@@ -162,27 +159,20 @@ def test_gnss_agreement_is_measured_and_drawn(street_map: Map) -> None:
     index = replace(street_map.index, georeference=origin.model_dump(), frame="world")
     near = body(
         street_map.report(
-            poses=one(poses),
-            tile_index=index,
-            gnss=one(fixes(origin, street_map.T[:, :3, 3] + [0.6, 0.8, 5.0])),
+            poses=one(poses), tile_index=index, graph=graph_of_fixes(street_map, [0.6, 0.8, 5.0])
         )
     )
     assert "agree to 1.00 m" in near
     assert "GNSS fix" in near
     assert f"EPSG:{origin.epsg}" in near
-    far = body(
-        street_map.report(poses=one(poses), gnss=one(fixes(origin, street_map.T[:, :3, 3] + [40, 0, 0])))
-    )
+    far = body(street_map.report(poses=one(poses), graph=graph_of_fixes(street_map, [40, 0, 0])))
     assert "Poor" in parse(far).text
 
 
-def fixes(origin: Georeference, positions: F8) -> Gnss:
-    where = world_to_geodetic(origin, positions)
-    n = len(positions)
-    return Gnss(
-        stamp_ns=stamps(n), latitude_deg=where[:, 0].copy(), longitude_deg=where[:, 1].copy(), height_m=where[:, 2].copy(),
-        covariance_m2=np.tile(np.eye(3), (n, 1, 1)), status=np.zeros(n, np.int8), satellites=np.full(n, 9, np.int16),
-    )  # fmt: skip
+def graph_of_fixes(street_map: Map, off_m: list[float], verdicts: list[str] | None = None) -> Graph:
+    """A fix for each of the five scans, so far from it."""
+    off = np.tile(np.array(off_m, float), (5, 1))
+    return fixes_graph(street_map.T[:, :3, 3] + off, -off, verdicts or ["used"] * 5)
 
 
 def test_false_loops_spoil_the_verdict(street_map: Map) -> None:
