@@ -9,10 +9,11 @@ import numpy as np
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.product import Parts
 from scanloom.schemas.session import Extrinsic, Session
-from scanloom.schemas.tracks import Gnss, Imu
+from scanloom.schemas.tracks import Gnss, Imu, Wheel
 from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.geometry.geodesy import georeference, world_to_geodetic
-from scanloom.stages.geometry.se3 import inverse, pose, se3_exp, so3_exp
+from scanloom.stages.geometry.interpolation import interpolate_poses
+from scanloom.stages.geometry.se3 import inverse, pose, se3_exp, so3_exp, so3_log
 
 ORIGIN = georeference(49.011, 8.4228, 112.0)
 START_NS = 1_700_000_000_000_000_000
@@ -118,6 +119,24 @@ def imu_of(world: World, seed: int = 2, sigma: float = 0.05, T_lidar_imu: np.nda
         stamp_ns=world.stamp_ns,
         gyro_rad_s=np.zeros((len(T), 3)),
         accel_m_s2=f + rng.normal(0, sigma, f.shape),
+    )
+
+
+def sensors_of(
+    world: World, scale: float = 1.0, bias: tuple[float, float, float] = (0.002, -0.001, 0.01)
+) -> tuple[Imu, Wheel]:
+    """Gyro and wheel speed at 50 Hz of a base that is the LiDAR moved by (0.5, 0, 1.7), with noise."""
+    rng = np.random.default_rng(0)
+    stamp = np.arange(world.stamp_ns[0], world.stamp_ns[-1], 20_000_000)
+    base = world.T.copy()
+    base[:, :3, 3] -= np.einsum("nij,j->ni", world.T[:, :3, :3], np.array([0.5, 0, 1.7]))
+    T = interpolate_poses(world.stamp_ns, base, np.append(stamp, stamp[-1] + 20_000_000))
+    motion = inverse(T[:-1]) @ T[1:]
+    rate = so3_log(motion[:, :3, :3]) / 0.02 + np.array(bias) + rng.normal(0, 0.002, (len(stamp), 3))
+    speed = motion[:, 0, 3] / 0.02 / scale + rng.normal(0, 0.02, len(stamp))
+    imu = Imu(stamp_ns=stamp + 10_000_000, gyro_rad_s=rate, accel_m_s2=np.tile([0, 0, 9.81], (len(stamp), 1)))
+    return imu, Wheel(
+        stamp_ns=stamp + 10_000_000, speed_m_s=speed, yaw_rate_rad_s=np.full(len(stamp), np.nan)
     )
 
 

@@ -12,7 +12,7 @@ from scanloom.schemas.errors import StageError
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.rig import ImuCheck, SensorCheck
-from scanloom.schemas.tracks import Gnss, Imu
+from scanloom.schemas.tracks import Gnss, Imu, Wheel
 from scanloom.schemas.trajectory import Odometry, Poses
 from scanloom.stages.fusion import Settings, fusion
 from scanloom.stages.geometry.geodesy import geodetic_to_world
@@ -42,11 +42,19 @@ def fuse(
     imu: Imu | None = None,
     odometry: Odometry = ODOMETRY,
     world: World = WORLD,
+    wheel: Wheel | None = None,
+    settings: Settings | None = None,
 ) -> tuple[Poses, Graph]:
     imu = imu_of(world) if imu is None else imu
     out = list(
         fusion(
-            Settings(), parts(a=session_of("a", world)), parts(a=odometry), loops, parts(a=gnss), parts(a=imu)
+            settings or Settings(),
+            parts(a=session_of("a", world)),
+            parts(a=odometry),
+            loops,
+            parts(a=gnss),
+            parts(a=imu),
+            None if wheel is None else parts(a=wheel),
         )
     )
     return out[0].product, out[1]
