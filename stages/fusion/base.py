@@ -1,7 +1,7 @@
 """The map that is extended: what its poses say to the graph, and which of them stay.
 
-`rigid`: a pose of the map is a fact. Each of its keyframes gets one stiff factor, nothing else of the old sessions pulls
-at them, and they come out as they went in, bit by bit.
+`rigid`: a pose of the map is a fact. Each of its keyframes gets one stiff factor, fixes and loops of the old sessions are
+not asked again, and the poses come out as they went in, bit by bit.
 
 `soft`: old and new measurements are solved together. The old poses are where the search starts, and get no prior: what
 their marginals sum up are the very loops, fixes and steps that are in the graph again, and a prior on each of them would
@@ -26,8 +26,8 @@ from scanloom.stages.geometry.se3 import F8, inverse, se3_exp, se3_log
 
 I8 = NDArray[np.int64]
 
-FIXED_SIGMA = (1e-5, 1e-4)
-"""Rotation rad, translation m: stiff enough that no loop moves a pose of the map, soft enough for the solver."""
+FIXED_SIGMA = (1e-4, 1e-3)
+"""Rotation rad, translation m: stiff against any loop, soft enough for the solver."""
 LEVER_M = 20.0
 """A turned pose moves what stands this far away; so far from the road most of a map lies."""
 SPAN_M = 20.0

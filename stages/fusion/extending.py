@@ -47,21 +47,18 @@ def in_frame_of(old: BaseMap | None, fixes: Sequence[Fixes]) -> list[Fixes]:
 def held(
     settings: Settings, factors: list[Factor], drives: Sequence[Drive], old: BaseMap | None
 ) -> list[Factor]:
-    """The factors of an extension: in `rigid` mode those between old poses give way to one stiff factor on each."""
+    """The factors of an extension: in `rigid` mode a stiff one on each old pose in place of old fixes and loops."""
     if old is None:
         return factors
     nodes, T = _old_nodes(drives, old)
     if settings.extension == "soft":
         return _soft(factors, nodes, T, georeferenced=old.origin is not None)
     within = set(nodes.tolist()) | {-1}
-    kept = []
-    for f in factors:
-        if f.i in within and f.j in within:
-            if f.kind in ("gnss", "loop"):
-                kept.append(replace(f, verdict=f.verdict or FROM_MAP))
-        elif f.kind != "prior":
-            kept.append(f)
-    return fixing(nodes, T) + kept
+    return fixing(nodes, T) + [
+        replace(f, verdict=f.verdict or FROM_MAP) if f.doubted and f.i in within and f.j in within else f
+        for f in factors
+        if f.kind != "prior"
+    ]
 
 
 def _soft(factors: list[Factor], nodes: I8, T: F8, *, georeferenced: bool) -> list[Factor]:
