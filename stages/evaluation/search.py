@@ -8,7 +8,6 @@ share of right ones among the candidates below it, recall the share of positives
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,34 +15,11 @@ from scanloom.schemas.loops import Loops
 from scanloom.stages.evaluation.figures import Figure
 from scanloom.stages.evaluation.loops import Judgement, Mask, loop_ends
 from scanloom.stages.evaluation.paths import TruePath
+from scanloom.stages.evaluation.precision import Curve
 from scanloom.stages.evaluation.revisits import FOUND_WITHIN_M, Revisits
 from scanloom.stages.geometry.se3 import F8
 
 RADII_M = (3, 4, 5, 10)
-
-
-@dataclass(frozen=True)
-class Curve:
-    """Precision and recall (n,) over increasing thresholds; the first takes the most alike candidate only."""
-
-    precision: F8
-    recall: F8
-
-    @property
-    def f1_max(self) -> float:
-        total = self.precision + self.recall
-        f1 = 2.0 * self.precision * self.recall / np.where(total > 0, total, 1.0)
-        return float(f1.max())
-
-    @property
-    def recall_at_full_precision(self) -> float:
-        """Largest recall without a wrong one; 0 when the most alike candidate is wrong already."""
-        return float(self.recall[self.precision >= 1.0].max(initial=0.0))
-
-    @property
-    def extended_precision(self) -> float:
-        """Mean of the precision at the smallest recall and the recall at full precision (Ferrarini et al. 2020)."""
-        return 0.5 * (float(self.precision[0]) + self.recall_at_full_precision)
 
 
 def precision_recall(distance: F8, right: Mask, first_found: F8) -> Curve:
@@ -57,7 +33,7 @@ def precision_recall(distance: F8, right: Mask, first_found: F8) -> Curve:
     taken = np.searchsorted(distance[order], thresholds, side="right")
     hits = np.cumsum(right[order])[taken - 1]
     recall = np.searchsorted(np.sort(first_found), thresholds, side="right") / len(first_found)
-    return Curve(hits / taken, recall)
+    return Curve(thresholds, hits / taken, recall)
 
 
 def search_figures(
@@ -79,17 +55,17 @@ def search_figures(
             f"candidate is within {FOUND_WITHIN_M:g} m of path"
         )
         name = f"loops.search_r{radius_m}"
-        yield Figure(f"{name}_f1_max", curve.f1_max, "", f"largest F1 {how}", "map")
+        yield Figure(f"{name}_f1_max", curve.f1_max(), "", f"largest F1 {how}", "map")
         yield Figure(
             f"{name}_recall_at_p1",
-            curve.recall_at_full_precision,
+            curve.recall_at(1.0),
             "",
             f"recall at full precision {how}",
             "map",
         )
         yield Figure(
             f"{name}_extended_precision",
-            curve.extended_precision,
+            curve.extended_precision(),
             "",
             f"mean of precision at the smallest recall and recall at full precision {how}",
             "map",

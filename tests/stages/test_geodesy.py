@@ -7,6 +7,7 @@ import pytest
 
 from scanloom.schemas.errors import StageError
 from scanloom.stages.geometry.geodesy import (
+    between_worlds,
     geodetic_to_world,
     georeference,
     projected_to_world,
@@ -106,3 +107,14 @@ def test_convergence_is_positive_east_of_the_central_meridian_in_the_north() -> 
 
 def test_a_chosen_projected_system_is_kept() -> None:
     assert georeference(49.0, 5.99, 0.0, epsg=32632).epsg == 32632
+
+
+def test_one_world_in_another_is_where_its_points_are() -> None:
+    here, there = georeference(49.0, 8.4, 110.0), georeference(49.02, 8.37, 240.0)
+    points = np.random.default_rng(0).uniform(-500, 500, (20, 3))
+    T = between_worlds(here, there)
+    want = geodetic_to_world(here, *world_to_geodetic(there, points).T)
+    assert np.abs(points @ T[:3, :3].T + T[:3, 3] - want).max() < 1e-6
+    assert np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-9
+    assert 100 < np.linalg.norm(T[:3, 3]) < 4000
+    assert np.array_equal(between_worlds(here, here), np.eye(4))

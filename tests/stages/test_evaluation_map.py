@@ -1,0 +1,347 @@
+"""Evaluation of loops, GNSS, several sessions and blind stretches: known faults go in, the same figures come out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scanloom.schemas.evaluation import Metrics
+from scanloom.schemas.loops import Loops
+from scanloom.schemas.pose_graph import Graph
+from scanloom.schemas.product import Parts
+from scanloom.schemas.tracks import Gnss
+from scanloom.schemas.trajectory import Truth
+from scanloom.stages.evaluation import evaluation
+from scanloom.stages.evaluation.search import precision_recall
+from scanloom.stages.evaluation.stage import Settings
+from scanloom.stages.geometry.geodesy import georeference, world_to_geodetic
+from scanloom.stages.geometry.se3 import F8, pose, se3_exp, so3_exp
+from tests.stages.mapping import (
+    fixes_graph,
+    graph_of,
+    loops_of,
+    odometry_of,
+    one,
+    poses_of,
+    session_of,
+    stamps,
+    truth_of,
+)
+
+HERE = georeference(48.137, 11.576, 560.0)
+LAP = 503
+"""Scans of one lap of `laps`."""
+ARC = 400
+"""Scans of an arc that does not come back to its start."""
+
+
+def laps(count: int = 1000, beside_m: float = 0.0) -> F8:
+    """A drive around a circle of 80 m radius, a metre a scan; `beside_m` farther out."""
+    turn = pose(so3_exp([0, 0, 1 / 80.0]), [1.0, 0, 0])
+    T = [np.eye(4)]
+    for _ in range(count - 1):
+        T.append(T[-1] @ turn)
+    return np.array(T) @ pose(np.eye(3), [0.0, -beside_m, 0.0])
+
+
+def figures_of(**given: Any) -> dict[str, float]:
+    return dict(zip(*(getattr(metrics_of(**given), name) for name in ("name", "value"))))
+
+
+def metrics_of(
+    *, T: F8 | dict[str, F8], loops: Loops | None = None, graph: Graph | None = None, gnss: Gnss | None = None,
+    truth: dict[str, Truth] | None = None, poses: dict[str, Any] | None = None, odometry: Any = None,
+) -> Metrics:  # fmt: skip
+    """Sessions that drove T, by the truth given, else exactly."""
+    paths = T if isinstance(T, dict) else {"a": T}
+    loops = Loops.empty() if loops is None else loops
+
+    def parts(products: dict[str, Any]) -> Parts[Any]:
+        return Parts([((("session", name),), product) for name, product in products.items()])
+
+    *_, metrics = evaluation(
+        Settings(), parts({n: session_of(n) for n in paths}),
+        parts({n: truth_of(t) for n, t in paths.items()} if truth is None else truth),
+        parts({n: odometry_of(t) for n, t in paths.items()}) if odometry is None else one(odometry),
+        parts({n: poses_of(t) for n, t in paths.items()} if poses is None else poses),
+        loops, graph_of(loops) if graph is None else graph, one(Gnss.empty() if gnss is None else gnss), Parts([]),
+    )  # fmt: skip
+    assert isinstance(metrics, Metrics)
+    return metrics
+
+
+# --- loops in use ---
+
+
+def test_only_loops_that_the_graph_uses_are_accepted() -> None:
+    T = laps()
+    loops = loops_of(T, [(10, 513), (200, 703), (400, 903)], [0.0, 0.0, 3.0])
+    figures = figures_of(T=T, loops=loops, graph=graph_of(loops, ["used", "used", "switched off: …"]))
+    assert (figures["loops.candidates"], figures["loops.verified"], figures["loops.accepted"]) == (3, 3, 2)
+    assert figures["loops.precision"] == 1.0
+    assert figures["loops.verified_precision"] == pytest.approx(2 / 3)
+    everything = figures_of(T=T, loops=loops)
+    assert everything["loops.accepted"] == 3
+    assert everything["loops.precision"] == pytest.approx(2 / 3)
+    nothing = figures_of(T=T, loops=loops, graph=Graph.empty())
+    assert nothing["loops.accepted"] == 0
+    assert "loops.precision" not in nothing
+    assert nothing["loops.recall"] == 0.0
+
+
+def test_only_keyframes_that_come_back_count_for_recall() -> None:
+    T = laps()
+    loops = loops_of(T, [(10, 513)], [0.0])
+    every = figures_of(T=T, loops=loops)["loops.recall"]
+    sparse = replace(odometry_of(T), keyframe=np.arange(1000) % 10 == 3)
+    few = figures_of(T=T, loops=loops, odometry=sparse)["loops.recall"]
+    assert every == pytest.approx(21 / 499, rel=0.02)  # 503 to 999 come back, and two scans around the start
+    assert few == pytest.approx(3 / 50, rel=0.05)
+
+
+@pytest.mark.parametrize(("beside_m", "recall"), [(3.9, 1.0), (4.1, None)])
+def test_a_place_is_the_same_within_four_metres(beside_m: float, recall: float | None) -> None:
+    """The second pass is driven beside the first, and closed at every tenth scan."""
+    T = np.concatenate([laps(ARC), laps(ARC, beside_m)])
+    closed = np.arange(5, ARC, 10)
+    loops = loops_of(T, [(int(k), ARC + int(k)) for k in closed], [0.0] * len(closed))
+    assert figures_of(T=T, loops=loops).get("loops.recall") == recall
+
+
+def test_no_loops_and_nothing_to_find_give_counts_alone() -> None:
+    figures = figures_of(T=laps(100))
+    assert figures["loops.accepted"] == figures["loops.candidates"] == 0
+    assert not [name for name in figures if "precision" in name or "recall" in name or "search" in name]
+
+
+# --- the search alone ---
+
+
+def test_precision_and_recall_over_thresholds_by_hand() -> None:
+    distance, right = np.array([0.3, 0.1, 0.2, 0.4]), np.array([False, True, True, True])
+    curve = precision_recall(distance, right, np.array([0.1, 0.1, 0.2, np.inf]))
+    assert curve.precision.tolist() == [1.0, 1.0, 2 / 3, 3 / 4]
+    assert curve.recall.tolist() == [0.5, 0.75, 0.75, 0.75]
+    assert curve.recall_at(1.0) == 0.75
+    assert curve.f1_max() == pytest.approx(6 / 7)
+    assert curve.extended_precision() == pytest.approx(0.875)
+
+
+def test_candidates_of_one_distance_come_together() -> None:
+    curve = precision_recall(np.array([0.2, 0.2]), np.array([True, False]), np.array([0.2]))
+    assert curve.precision.tolist() == [0.5]
+    assert curve.recall_at(1.0) == 0.0
+
+
+def test_a_candidate_is_right_within_the_radius_and_wrong_beyond() -> None:
+    T = np.concatenate([laps(ARC), laps(ARC, 4.5)])
+    pairs = [(int(k), ARC + int(k)) for k in range(5, ARC, 10)]
+    loops = loops_of(T, pairs, [0.0] * len(pairs))
+    figures = figures_of(T=T, loops=loops)
+    assert "loops.search_r4_f1_max" not in figures  # nothing comes within four metres
+    for radius in (5, 10):
+        assert figures[f"loops.search_r{radius}_f1_max"] == pytest.approx(1.0, abs=0.01)
+        assert figures[f"loops.search_r{radius}_recall_at_p1"] == pytest.approx(1.0, abs=0.02)
+
+
+def test_look_alike_places_cost_precision_and_unseen_ones_recall() -> None:
+    T = laps()
+    pairs = [(int(k), LAP + int(k)) for k in range(5, 300, 10)]
+    wrong = [(int(k), LAP + 150 + int(k)) for k in range(5, 100, 10)]
+    loops = loops_of(T, pairs + wrong, [0.0] * 40)
+    distance = np.concatenate((np.linspace(0.1, 0.2, 30), np.full(10, 0.15)))
+    figures = figures_of(T=T, loops=replace(loops, descriptor_distance=distance))
+    assert figures["loops.search_r4_recall_at_p1"] == pytest.approx(0.3, abs=0.03)  # half of 300 of 500
+    assert figures["loops.search_r4_extended_precision"] == pytest.approx(0.65, abs=0.02)
+    assert figures["loops.search_r4_f1_max"] == pytest.approx(2 * 0.75 * 0.6 / 1.35, abs=0.03)
+    by_position = replace(loops, descriptor_distance=np.full(40, np.nan))
+    assert not [name for name in figures_of(T=T, loops=by_position) if "search" in name]
+
+
+# --- GNSS ---
+
+
+def gnss_of(positions: F8, status: np.ndarray) -> Gnss:
+    where = world_to_geodetic(HERE, positions)
+    n = len(positions)
+    return Gnss(
+        stamp_ns=stamps(n), latitude_deg=where[:, 0].copy(), longitude_deg=where[:, 1].copy(), height_m=where[:, 2].copy(),
+        covariance_m2=np.tile(np.eye(3), (n, 1, 1)), status=status.astype(np.int8), satellites=np.full(n, 9, np.int16),
+    )  # fmt: skip
+
+
+def test_fixes_are_told_apart_by_what_the_receiver_said() -> None:
+    T = laps(100)
+    status = np.repeat([2, 0, -1], [60, 30, 10])
+    off = np.zeros((100, 3))
+    off[:60, 0] = np.linspace(0.0, 1.0, 60)
+    off[60:90] = [3.0, 4.0, 50.0]
+    off[90:] = np.nan
+    verdicts = (
+        ["used"] * 45 + ["sigma 7 m"] * 5 + ["sigma 8 m"] * 10 + ["used"] * 3 + ["the receiver's lie"] * 37
+    )
+    poses = {"a": poses_of(T, georeference=HERE.model_dump())}
+    graph = fixes_graph(T[:, :3, 3], off, verdicts)
+    figures = figures_of(T=T, poses=poses, graph=graph, gnss=gnss_of(T[:, :3, 3], status))
+    assert (figures["gnss.fixes"], figures["gnss.used"]) == (100, 48)
+    assert figures["gnss.left_out.sigma_m"] == 15
+    assert figures["gnss.left_out.the_receivers_lie"] == 37
+    assert figures["gnss.status_2.used_share"] == 0.75
+    assert figures["gnss.status_2.residual_median_m"] == pytest.approx(0.5)
+    assert figures["gnss.status_2.residual_p95_m"] == pytest.approx(0.95)
+    assert figures["gnss.status_0.used_share"] == 0.1
+    assert figures["gnss.status_0.residual_median_m"] == 5.0  # height is left out
+    assert figures["gnss.status_-1.fixes"] == 10
+    assert "gnss.status_-1.residual_median_m" not in figures
+
+
+def test_without_a_georeference_fixes_have_no_residuals() -> None:
+    T = laps(20)
+    graph = fixes_graph(T[:, :3, 3], np.ones((20, 3)), ["too few good fixes"] * 20)
+    figures = figures_of(T=T, graph=graph, gnss=gnss_of(T[:, :3, 3], np.zeros(20)))
+    assert figures["gnss.used"] == 0
+    assert figures["gnss.status_0.used_share"] == 0.0
+    assert not [name for name in figures if "residual" in name]
+
+
+def test_a_session_without_gnss_has_no_figures_of_it() -> None:
+    assert not [name for name in figures_of(T=laps(20)) if name.startswith("gnss")]
+
+
+# --- errors on the Earth ---
+
+
+def test_the_error_on_the_earth_is_that_of_the_place() -> None:
+    T = laps(200)
+    elsewhere = georeference(48.138, 11.577, 565.0)
+    truth = {"a": replace(truth_of(T), georeference=elsewhere.model_dump())}
+    origin = world_to_geodetic(HERE, [[0.0, 0.0, 0.0]])[0]
+    assert origin == pytest.approx([48.137, 11.576, 560.0])
+    from scanloom.stages.geometry.geodesy import between_worlds
+
+    right = between_worlds(HERE, elsewhere) @ T
+    moved = right.copy()
+    moved[:, 0, 3] += 2.0
+    for poses, want in ((right, 0.0), (moved, 2.0)):
+        figures = figures_of(T=T, truth=truth, poses={"a": poses_of(poses, georeference=HERE.model_dump())})
+        assert figures["fusion.absolute_rmse_m"] == pytest.approx(want, abs=1e-6)
+        assert figures["fusion.ate_rmse_m"] < 1e-6
+    local = figures_of(T=T, truth=truth, poses={"a": poses_of(right)})
+    assert "fusion.absolute_rmse_m" not in local
+    assert "fusion.absolute_rmse_m" not in figures_of(
+        T=T, poses={"a": poses_of(right, georeference=HERE.model_dump())}
+    )
+
+
+@pytest.mark.parametrize(("sure", "want"), [(1.0, 3.0), (4.0, 12.0), (0.25, 0.75)])
+def test_marginals_are_held_against_the_errors_there_are(sure: float, want: float) -> None:
+    """Errors drawn in the LiDAR's frame from a slanted covariance; the map says it is `sure` times as certain."""
+    T = laps(900)
+    spread = np.array([[0.3, 0.0, 0.0], [0.1, 0.1, 0.0], [0.0, 0.05, 0.5]])
+    xi = np.zeros((900, 6))
+    xi[:, 3:] = np.random.default_rng(0).normal(size=(900, 3)) @ spread.T
+    covariance = np.zeros((900, 6, 6))
+    covariance[:, 3:, 3:] = spread @ spread.T / sure
+    poses = replace(poses_of(T @ se3_exp(xi), georeference=HERE.model_dump()), covariance=covariance)
+    truth = {"a": replace(truth_of(T), georeference=HERE.model_dump())}
+    assert figures_of(T=T, truth=truth, poses={"a": poses})["fusion.nees_translation"] == pytest.approx(
+        want, rel=0.15
+    )
+
+
+def test_marginals_that_nobody_knows_have_no_honesty() -> None:
+    T = laps(30)
+    poses = replace(poses_of(T), covariance=np.full((30, 6, 6), np.nan))
+    assert "fusion.nees_translation" not in figures_of(T=T, poses={"a": poses})
+
+
+# --- several sessions ---
+
+
+def two(T_a: F8, T_b: F8, *, known: bool = True) -> dict[str, Any]:
+    """Two sessions whose truths share a frame when `known`."""
+    place = HERE.model_dump() if known else None
+    truth = {n: replace(truth_of(T), georeference=place) for n, T in (("a", T_a), ("b", T_b))}
+    return {"T": {"a": T_a, "b": T_b}, "truth": truth}
+
+
+def test_sessions_that_lie_wrong_to_each_other_are_seen() -> None:
+    T_a, T_b = laps(300), laps(300, 2.0)
+    shifted = pose(so3_exp([0, 0, 0.0]), [0.3, 0.4, 0.0]) @ T_b
+    figures = figures_of(**two(T_a, T_b), poses={"a": poses_of(T_a), "b": poses_of(shifted)})
+    assert figures["fusion.inter_session_rmse_m"] == pytest.approx(0.5, abs=1e-6)
+    assert figures["fusion.inter_session_rmse_deg"] < 1e-6
+    both_moved = {n: poses_of(pose(so3_exp([0, 0, 1.0]), [9, 9, 0]) @ T) for n, T in (("a", T_a), ("b", T_b))}
+    assert figures_of(**two(T_a, T_b), poses=both_moved)["fusion.inter_session_rmse_m"] < 1e-6
+
+
+@pytest.mark.parametrize(("beside_m", "meets"), [(4.99, True), (5.01, False)])
+def test_sessions_are_compared_where_both_pass_within_five_metres(beside_m: float, meets: bool) -> None:
+    figures = figures_of(**two(laps(200), laps(200, beside_m)))
+    assert ("fusion.inter_session_rmse_m" in figures) == meets
+
+
+def test_truths_in_frames_of_their_own_say_nothing_of_each_other() -> None:
+    T = laps(200)
+    loops = loops_of(T, [(50, 50)], [0.0])
+    loops = replace(loops, session_j=np.array(["b"], object))
+    apart = figures_of(**two(T, T, known=False), loops=loops)
+    assert "fusion.inter_session_rmse_m" not in apart
+    assert "loops.precision" not in apart
+    assert "loops.recall" not in apart
+    together = figures_of(**two(T, T), loops=loops)
+    assert together["loops.between_sessions"] == apart["loops.between_sessions"] == 1
+    assert together["loops.precision"] == 1.0
+
+
+def test_what_an_earlier_session_saw_ought_to_be_found() -> None:
+    T = laps(200)
+    given = two(T, T)
+    later = given["truth"]["b"].stamp_ns + 3_600_000_000_000
+    given["truth"]["b"] = replace(given["truth"]["b"], stamp_ns=later)
+    odometry = Parts(
+        [
+            ((("session", "a"),), odometry_of(T)),
+            ((("session", "b"),), replace(odometry_of(T), stamp_ns=later)),
+        ]
+    )
+    pairs = [(int(k), int(k)) for k in range(5, 100, 10)]
+    loops = replace(loops_of(T, pairs, [0.0] * 10), session_j=np.array(["b"] * 10, object))
+    *_, metrics = evaluation(
+        Settings(), Parts([((("session", n),), session_of(n)) for n in "ab"]),
+        Parts([((("session", n),), t) for n, t in given["truth"].items()]), odometry,
+        Parts([((("session", "a"),), poses_of(T)), ((("session", "b"),), replace(poses_of(T), stamp_ns=later))]),
+        loops, graph_of(loops), Parts([]), Parts([]),
+    )  # fmt: skip
+    assert isinstance(metrics, Metrics)
+    figures = dict(zip(metrics.name, metrics.value))
+    assert figures["loops.recall"] == pytest.approx(
+        0.53, abs=0.006
+    )  # of 200 scans of b, 0 to 105 have a loop within 10 m
+
+
+# --- blind stretches ---
+
+
+def test_blind_stretches_are_measured_and_segments_counted() -> None:
+    T = laps(200)
+    p = np.ones((200, 6))
+    p[0] = 0.0  # the first scan has no motion to be seen
+    p[50:60, 3] = 0.2
+    p[100:140, 0] = 0.4
+    odometry = replace(odometry_of(T), direction_p=p)
+    figures = figures_of(T=T, odometry=odometry)
+    assert figures["odometry.degenerate_share"] == pytest.approx(50 / 200)
+    assert figures["odometry.degenerate_longest_m"] == pytest.approx(40.0, abs=0.01)
+    assert "odometry.segments" not in figures
+    split = replace(odometry, segment=np.repeat([0, 1, 2], [60, 60, 80]).astype(np.int32))
+    assert figures_of(T=T, odometry=split)["odometry.segments"] == 3
+
+
+def test_one_scan_is_no_stretch() -> None:
+    figures = figures_of(T=np.eye(4)[None])
+    assert figures["odometry.degenerate_share"] == 0.0
+    assert figures["odometry.degenerate_longest_m"] == 0.0
