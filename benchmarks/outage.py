@@ -17,6 +17,7 @@ from benchmarks.scores import Figure
 from scanloom.pipeline.request import Request, SessionInput
 from scanloom.pipeline.run import Result, run
 from scanloom.pipeline.store import Store
+from scanloom.schemas.base import BaseLog
 from scanloom.schemas.product import Parts, Product
 from scanloom.schemas.tracks import Gnss
 from scanloom.schemas.trajectory import Odometry, Poses, Truth
@@ -45,6 +46,7 @@ def figures(store: Path) -> Iterator[Figure]:
     ratios, worst = [], []
     for seed in SEEDS:
         given = _made(seed, store)
+        yield from _with_and_without(seed, given)
         errors = {name: _errors(given, settings) for name, settings in VARIANTS.items()}
         for name, e in errors.items():
             prefix = f"sample.seed_{seed}.outage_60s.{name}"
@@ -74,7 +76,9 @@ def figures(store: Path) -> Iterator[Figure]:
 
 def _made(seed: int, store: Path) -> dict[type[Product], Any]:
     """What fusion reads, and the truth, of the sample driven with another seed; taken from the store where it is there."""
-    session = SessionInput("sample", {}, {"simulate": {"seed": seed}}, frozenset({SIMULATED}))
+    session = SessionInput(
+        "sample", {BaseLog: BaseLog()}, {"simulate": {"seed": seed}}, frozenset({SIMULATED})
+    )
     result = run(Request(nodes=MAKERS, sessions=(session,)), Store(store))
     for task in result.failures:
         if task.error is not None:
@@ -88,11 +92,18 @@ def _parts(result: Result, product: type[Product]) -> Any:
     return found if found and "session" in dict(next(iter(result.files(product)))[0]) else found[0]
 
 
-def _errors(given: Mapping[type[Product], Any], settings: Settings) -> Errors:
+def _with_and_without(seed: int, given: Mapping[type[Product], Any]) -> Iterator[Figure]:
+    for name, length_s in (("with_gnss", 0.0), ("without_gnss", float("inf"))):
+        e = _errors(given, Settings(), length_s)
+        how = f"{name.replace('_', ' ')}: root mean square distance to truth after one rigid alignment"
+        yield Figure(f"sample.seed_{seed}.{name}.ate_rmse_m", alignment.rms(e.distance_m), "m", how)
+
+
+def _errors(given: Mapping[type[Product], Any], settings: Settings, length_s: float = OUTAGE_S) -> Errors:
     odometry: Odometry = given[Odometry][0]
     truth: Truth = given[Truth][0]
     middle_ns = _tunnel_ns(odometry)
-    blanked = {**given, Gnss: _without(given[Gnss], middle_ns)}
+    blanked = {**given, Gnss: _without(given[Gnss], middle_ns, length_s)}
     poses = next(
         part.product
         for part in fusion(settings, *[blanked.get(p) for p in FUSION.reads])
@@ -100,7 +111,7 @@ def _errors(given: Mapping[type[Product], Any], settings: Settings) -> Errors:
     )
     known = inside(truth.stamp_ns, poses.stamp_ns)
     true = interpolate_poses(truth.stamp_ns, truth.T_truth_lidar, poses.stamp_ns[known])
-    near = np.abs(poses.stamp_ns[known] - middle_ns) < 0.5e9 * OUTAGE_S
+    near = np.abs(poses.stamp_ns[known] - middle_ns) < 0.5e9 * length_s
     return Errors(alignment.absolute_errors(true, poses.T_world_lidar[known]), near)
 
 
@@ -112,10 +123,10 @@ def _tunnel_ns(odometry: Odometry) -> int:
     return int(odometry.stamp_ns[(first + last) // 2])
 
 
-def _without(gnss: Parts[Gnss], middle_ns: int) -> Parts[Gnss]:
+def _without(gnss: Parts[Gnss], middle_ns: int, length_s: float) -> Parts[Gnss]:
     changed = []
     for where, fixes in gnss.items():
-        off = np.abs(fixes.stamp_ns - middle_ns) < 0.5e9 * OUTAGE_S
+        off = np.abs(fixes.stamp_ns - middle_ns) < 0.5e9 * length_s
         status = np.where(off, -1, fixes.status).astype(np.int8)
         changed.append((tuple(where.items()), dataclasses.replace(fixes, status=status)))
     return Parts(changed)
