@@ -52,7 +52,7 @@ class EstatePlan:
     @classmethod
     def of(cls, town_seed: int) -> EstatePlan:
         rng = np.random.default_rng((town_seed, 5))
-        street, apart, period = rng.uniform(78, 90), rng.uniform(43, 50), rng.uniform(23.5, 26)
+        street, apart, period = rng.uniform(78, 90), rng.uniform(43, 50), rng.uniform(26, 27.5)
         a, b, c = rng.uniform(0, 2 * np.pi, 3)
         return cls(float(street), float(apart), float(period), (float(a), float(b), float(c)))
 

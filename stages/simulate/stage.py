@@ -3,8 +3,8 @@
 The town has streets with houses, walls, poles, trees and bushes, parked and driving cars, a cyclist, pedestrians, a
 tunnel, an open field, a bridge over a street, and is driven twice in the same and once in the opposite direction. The LiDAR
 moves while it turns; ranges are noisy, returns are lost, dust rolls; the IMU has noise, bias and a lever arm; the wheels
-slip and measure one per cent too much; GNSS fails in the tunnel and lies between high houses. The same seed gives the same
-bytes.
+slip and measure one per cent too much; GNSS fails in the tunnel and lies between high houses. A second world, the estate, has
+parallel streets that look alike and one that repeats itself. The same seed gives the same bytes.
 """
 
 from __future__ import annotations
