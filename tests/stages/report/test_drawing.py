@@ -5,7 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scanloom.stages.report.charts import Curve, line_chart, nice_top, thin, ticks
+from scanloom.stages.report.charts import (
+    Bands,
+    Curve,
+    Dots,
+    Strip,
+    chart,
+    exact,
+    line_chart,
+    linear,
+    logarithmic,
+    nice_top,
+    thin,
+    ticks,
+)
 from scanloom.stages.report.figures import number
 from scanloom.stages.report.overlay import round_length
 from scanloom.stages.report.raster import fit_view
@@ -61,3 +74,64 @@ def test_numbers_are_short() -> None:
     assert number(0.123456) == "0.1235"
     assert number(1e-15) == "0"
     assert number(float("nan")) == "–"
+
+
+def test_thinning_is_that_of_a_plain_loop() -> None:
+    y = np.random.default_rng(0).normal(size=1777)
+    x_thin, y_thin = thin(np.arange(1777.0), y)
+    groups = np.split(np.arange(1777), np.linspace(0, 1777, 501).astype(int)[1:-1])
+    assert x_thin.tolist() == [float(group[np.argmax(y[group])]) for group in groups]
+    assert np.array_equal(y_thin, y[x_thin.astype(int)])
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "want"),
+    [
+        (0.001, 0.0, [0.001, 0.01]),
+        (0.001, 5.0, [0.001, 0.01, 0.1, 1, 10]),
+        (0.01, 0.1, [0.01, 0.1]),
+        (1.0, 1.1e7, [1, 1e2, 1e4, 1e6, 1e8]),
+    ],
+)
+def test_decades_cover_every_value_and_are_few(low: float, high: float, want: list[float]) -> None:
+    axis = logarithmic(low, high)
+    assert list(axis.ticks) == pytest.approx(want)
+    assert axis.high >= high
+    assert len(axis.ticks) <= 7
+
+
+def test_shares_are_those_of_the_axis_and_stay_on_it() -> None:
+    axis = logarithmic(0.01, 100.0)
+    assert axis.share(np.array([0.01, 1.0, 100.0, 0.0, -5.0, 1e9])).tolist() == pytest.approx(
+        [0, 0.5, 1, 0, 0, 1]
+    )
+    assert linear(9.0).share(np.array([0.0, 5.0])).tolist() == [0.0, 0.5]
+    assert exact(0.0).share(np.array([0.0])).tolist() == [0.0]
+
+
+def test_dots_stand_where_their_values_are() -> None:
+    drawn = Dots("fixes", np.array([25.0, 100.0]), np.array([1.0, 0.1]), "used").draw(
+        exact(100.0), logarithmic(0.01, 1.0)
+    )
+    assert 'd="M250.0 0.0h0M1000.0 100.0h0"' in drawn
+
+
+def test_bands_are_merged_where_nobody_could_tell_them_apart_and_never_vanish() -> None:
+    x_axis = exact(1000.0)
+    ranges = np.array([[100.0, 100.0], [400.0, 420.0], [420.5, 450.0], [470.0, 480.0]])
+    drawn = Bands("blind", ranges, "blind").draw(x_axis, linear(1.0))
+    assert "M100.0 0H101.5V" in drawn
+    assert "M400.0 0H450.0V" in drawn
+    assert drawn.count("z") == 3
+    crowd = np.column_stack((np.arange(0.0, 1000.0, 0.1), np.arange(0.0, 1000.0, 0.1) + 0.05))
+    assert Bands("blind", crowd, "blind").draw(x_axis, linear(1.0)).count("z") == 1
+    assert Bands("blind", np.empty((0, 2)), "blind").draw(x_axis, linear(1.0)) == ""
+
+
+def test_a_chart_has_labels_of_both_axes_and_rows_below() -> None:
+    strips = [Strip("along", np.array([[0.0, 5.0]]), "blind"), Strip("<up>", np.empty((0, 2)), "blind")]
+    drawn = chart([], exact(10.0), linear(1.0), "way & time", "error, m", strips)
+    assert drawn.count("<svg") == 3
+    assert "way &amp; time" in drawn
+    assert "&lt;up&gt;" in drawn
+    assert drawn.count("left:") == len(ticks(10.0))

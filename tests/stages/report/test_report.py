@@ -287,3 +287,49 @@ def test_what_the_scans_said_of_the_sensors_is_told_and_escaped(street_map: Map)
     assert "Wheels: &lt;no&gt; known unit." in page
     assert '<span class="pill warning">sensors</span>' in page
     assert "sensors</span>" not in body(street_map.report())
+
+
+def test_what_the_graph_warns_of_lowers_the_verdict_and_what_it_remarks_does_not(street_map: Map) -> None:
+    quiet = replace(Graph.empty(), remarks=("a: the receiver's clock is <0.2 s> late",))
+    page = body(street_map.report(graph=quiet))
+    assert "clock is &lt;0.2 s&gt; late." in page
+    assert '<div class="word">Good</div>' in page
+    loud = replace(quiet, warnings=("session a hangs on one loop only",))
+    page = body(street_map.report(graph=loud))
+    assert "session a hangs on one loop only." in page
+    assert '<div class="word">Fair</div>' in page
+
+
+def test_loops_gnss_and_blind_stretches_have_their_sections(street_map: Map) -> None:
+    loops = loops_of(street_map.T, [(0, 4), (1, 4)], [0.0, 0.0])
+    loops = replace(loops, accepted=np.array([True, False]), reason=np.array(["", "<unlike>"], object))
+    origin = georeference(48.1, 11.6, 520.0).model_dump()
+    graph = Graph.concatenate([graph_of(loops), graph_of_fixes(street_map, [0.6, 0.8, 5.0])])
+    poses = one(poses_of(street_map.T, georeference=origin))
+    index = replace(street_map.index, georeference=origin, frame="world")
+    page = body(street_map.report(loops=loops, graph=graph, poses=poses, tile_index=index))
+    text = parse(page).text
+    for heading in ("Loops", "GNSS along the way", "What odometry could not see", "Pose graph"):
+        assert f"<h2>{heading}</h2>" in page
+    assert "in use: 1" in text
+    assert "compared and refused: 1" in text
+    assert "<unlike>" in text
+    assert "used: 5" in text
+    assert "Every direction was seen" in text
+    assert "loop closure" in text
+
+
+def test_a_map_without_loops_and_gnss_has_no_sections_of_them(street_map: Map) -> None:
+    page = body(street_map.report())
+    for heading in ("Loops", "GNSS along the way", "Pose graph"):
+        assert f"<h2>{heading}</h2>" not in page
+
+
+def test_a_loop_that_the_graph_left_out_is_not_drawn_on_the_map(street_map: Map) -> None:
+    loops = loops_of(street_map.T, [(0, 4)], [0.0])
+    street_map.report(loops=loops)
+    assert "loop: scan 0 and 4" in street_map.drawn.read("overlay.svg").decode()
+    page = body(street_map.report(loops=loops, graph=graph_of(loops, ["switched off"])))
+    assert "loop: scan" not in street_map.drawn.read("overlay.svg").decode()
+    assert "loop closure" not in page
+    assert "passed the tests, left out by the graph: 1" in parse(page).text
