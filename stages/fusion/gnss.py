@@ -7,7 +7,8 @@ solver's own robustness see that. When most fixes disagree none is believed: bet
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from scanloom.stages.fusion.receiver import Flags, Texts, mark, plausible, recei
 from scanloom.stages.geometry.geodesy import geodetic_to_world
 from scanloom.stages.geometry.se3 import F8
 
-__all__ = ["Fixes", "GnssSettings", "judge", "positions", "screen"]
+__all__ = ["Fixes", "GnssSettings", "judge", "middle", "positions", "refusals", "screen"]
 
 WHOLE_DRIFT = 0.04
 """Of odometry over a whole session, m per m: how far a fix may lie from the session laid on GNSS as a rigid whole."""
@@ -54,8 +55,7 @@ def judge(
     level, way = antenna_level(drive, R_level_odom), drive.travelled_at(drive.gnss.stamp_ns)
     remark = ""
     if len(passed) > 1 and np.ptp(way[passed]) > LEAST_WAY_M:
-        doubted = receiver_sigma(settings, drive.gnss)[passed]
-        remark = _against_motion(settings, verdict, passed, level, world, way, doubted)
+        remark = _against_motion(settings, drive.gnss, verdict, level, world, way)
     kept = np.flatnonzero(verdict == "")
     alignment = None
     if not remark and len(kept) >= 2:
@@ -79,16 +79,44 @@ def positions(gnss: Gnss, origin: Georeference) -> F8:
     return world
 
 
+def middle(gnss: Gnss) -> Georeference:
+    """A frame in the midst of the fixes, wherever some of them may lie; without a projection."""
+    there = plausible(gnss)
+    return Georeference(
+        epsg=0,
+        latitude_deg=float(np.median(gnss.latitude_deg[there])) if there.any() else 0.0,
+        longitude_deg=float(np.median(gnss.longitude_deg[there])) if there.any() else 0.0,
+        height_m=float(np.median(gnss.height_m[there])) if there.any() else 0.0,
+        easting_m=0,
+        northing_m=0,
+        grid_convergence_rad=0,
+        point_scale=1,
+    )
+
+
+def refusals(drives: Sequence[Drive], fixes: Sequence[Fixes]) -> list[str]:
+    """Of every session with fixes that GNSS does not place: why, in a sentence."""
+    out: dict[str, str] = {}
+    placed = {d.name for d, f in zip(drives, fixes, strict=True) if f.alignment is not None}
+    local = "" if placed else "; the map has a local frame"
+    for d, f in zip(drives, fixes, strict=True):
+        if d.name not in placed and len(d.gnss) and d.name not in out:
+            reasons, count = np.unique(f.verdict.astype(str), return_counts=True)
+            reason = str(reasons[int(np.argmax(count))]) or f.remark
+            out[d.name] = f"{d.name}: GNSS is not used: {reason}{local}"
+    return list(out.values())
+
+
 def antenna_level(drive: Drive, R_level_odom: F8) -> F8:
     """Antenna (n, 3) at the times of the fixes by odometry, made level, m."""
     T = drive.T_odom_lidar_at(drive.gnss.stamp_ns)
     return np.asarray((T[:, :3, :3] @ drive.antenna_m + T[:, :3, 3]) @ R_level_odom.T)
 
 
-def _against_motion(
-    settings: GnssSettings, verdict: Texts, passed: np.ndarray, level: F8, world: F8, way: F8, sigma: F8
-) -> str:
+def _against_motion(settings: GnssSettings, gnss: Gnss, verdict: Texts, level: F8, world: F8, way: F8) -> str:
     """Mark the fixes that contradict odometry; a remark when too few are left to be believed."""
+    passed = np.flatnonzero(verdict == "")
+    sigma = receiver_sigma(settings, gnss)[passed]
     p, q, driven = _plane(level[passed]), _plane(world[passed]), way[passed]
 
     def agree(fixes: C16) -> Flags:
@@ -99,9 +127,12 @@ def _against_motion(
     keep = agree(q)
     share = _share_of_way(driven, keep)
     if share < settings.min_agreeing:
-        mirrored = _share_of_way(driven, agree(np.conj(q)))
-        if mirrored >= max(settings.min_agreeing, 2.0 * share):
-            return "positions are mirrored: a sign of latitude or longitude is wrong, or they are swapped"
+        enough = max(settings.min_agreeing, 2.0 * share)
+        if _share_of_way(driven, agree(np.conj(q))) >= enough:
+            return "positions are mirrored: the sign of latitude or longitude is wrong"
+        swapped = _swapped(gnss.take(passed))
+        if np.isfinite(swapped).all() and _share_of_way(driven, agree(swapped)) >= enough:
+            return "latitude and longitude are swapped"
         return f"fixes contradict the motion of the vehicle on {100 * (1 - share):.0f} % of its way; none is used"
     mark(verdict, np.isin(np.arange(len(verdict)), passed[~keep]), "disagrees with the motion odometry saw")
     up = (world - level)[passed[keep], 2] + 0j
@@ -110,6 +141,12 @@ def _against_motion(
     )
     mark(verdict, np.isin(np.arange(len(verdict)), passed[keep][~steady]), "height jumps against odometry's")
     return ""
+
+
+def _swapped(gnss: Gnss) -> C16:
+    """Positions (n,) with latitude and longitude exchanged, m."""
+    other = replace(gnss, latitude_deg=gnss.longitude_deg, longitude_deg=gnss.latitude_deg)
+    return _plane(positions(other, middle(other)))
 
 
 def _share_of_way(way: F8, keep: Flags) -> float:

@@ -11,7 +11,7 @@ from scanloom.schemas.tracks import Gnss
 from scanloom.stages.fusion.base import BaseMap
 from scanloom.stages.fusion.drives import Drive
 from scanloom.stages.fusion.extending import in_frame_of
-from scanloom.stages.fusion.gnss import Fixes, judge, screen
+from scanloom.stages.fusion.gnss import Fixes, judge, middle, screen
 from scanloom.stages.fusion.gravity import Gravity, level
 from scanloom.stages.fusion.settings import Settings
 from scanloom.stages.geometry.geodesy import georeference
@@ -30,11 +30,7 @@ def place_by_gnss(
     origin = old.origin if old is not None else _origin(settings, drives, verdicts, levels)
     judged = []
     for d, verdict, R in zip(drives, verdicts, levels, strict=True):
-        at = origin or _first_position(d) or Georeference(
-            epsg=0, latitude_deg=0, longitude_deg=0, height_m=0, easting_m=0, northing_m=0, grid_convergence_rad=0,
-            point_scale=1,
-        )  # fmt: skip
-        judged.append(judge(settings.gnss, d, verdict, at, R))
+        judged.append(judge(settings.gnss, d, verdict, origin or middle(d.gnss), R))
     return origin, in_frame_of(old, judged)
 
 
@@ -54,19 +50,11 @@ def _judged_at_first_fix(settings: Settings, d: Drive, verdict: np.ndarray, R: F
     passed = np.flatnonzero(verdict == "")
     if not len(passed):
         return None
-    provisional = _georeference(d.gnss, int(passed[0]))
-    fixes = judge(settings.gnss, d, verdict, provisional, R)
+    fixes = judge(settings.gnss, d, verdict, middle(d.gnss.take(passed)), R)
     used = np.flatnonzero(fixes.verdict == "")
     if fixes.alignment is None or not len(used):
         return None
     return _georeference(d.gnss, int(used[0]))
-
-
-def _first_position(d: Drive) -> Georeference | None:
-    finite = (
-        np.isfinite(d.gnss.latitude_deg) & np.isfinite(d.gnss.longitude_deg) & np.isfinite(d.gnss.height_m)
-    )
-    return _georeference(d.gnss, int(np.argmax(finite))) if finite.any() else None
 
 
 def _georeference(gnss: Gnss, row: int) -> Georeference:

@@ -27,6 +27,7 @@ from scanloom.stages.fusion.bridging import bridges, guessed
 from scanloom.stages.fusion.drives import Drive, gather
 from scanloom.stages.fusion.extending import final, held, on_base, on_ties
 from scanloom.stages.fusion.factors import graph_table, position_residuals, whitened_norms
+from scanloom.stages.fusion.gnss import refusals
 from scanloom.stages.fusion.gravity import gravity
 from scanloom.stages.fusion.links import links
 from scanloom.stages.fusion.placing import place_by_gnss, placed
@@ -81,7 +82,7 @@ def fusion(
     for name, segments in groupby(drives, key=lambda d: d.name):
         solved = Poses.concatenate([poses_of(d, solution, covariance, origin) for d in segments])
         yield Part(final(settings, name, solved, old), name)
-    warnings = guessed(drives, gaps, found, fixes) + on_ties(drives, fixes, factors, old)
+    warnings = refusals(drives, fixes) + guessed(drives, gaps, found, fixes) + on_ties(drives, fixes, factors, old)
     after = whitened_norms(factors, solution.T)
     residual_m = position_residuals(factors, solution.T)
     table = graph_table(factors, before, after, residual_m, _key(drives))

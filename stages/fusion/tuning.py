@@ -8,17 +8,16 @@ from itertools import groupby
 
 import numpy as np
 
-from scanloom.schemas.frames import Georeference
 from scanloom.stages.fusion import clock, lever_arm
 from scanloom.stages.fusion.calibration import Calibration, Motion, calibrate
 from scanloom.stages.fusion.drives import Drive
-from scanloom.stages.fusion.gnss import positions
+from scanloom.stages.fusion.gnss import middle, positions
 from scanloom.stages.fusion.gnss_settings import GnssSettings
 from scanloom.stages.fusion.gravity import Gravity, level
 from scanloom.stages.fusion.receiver import screened
 from scanloom.stages.geometry.se3 import F8, pose
 
-CLOCK_SIGMA_S, ANTENNA_SIGMA_M, SCALE_SIGMA = 1.0, 2.0, 0.02
+CLOCK_SIGMA_S, ANTENNA_SIGMA_M, SCALE_SIGMA = 0.3, 2.0, 0.02
 PINNED_S, PINNED_M = 1e-4, 1e-3
 CLEAR_SCALE = 0.005
 
@@ -80,13 +79,9 @@ def _motion(settings: GnssSettings, drive: Drive, up: Gravity) -> Motion | None:
     if len(good) < 2 or len(drive.odometry) < 2:
         return None
     gnss = drive.gnss.take(good)
-    first = Georeference(
-        epsg=0, latitude_deg=float(gnss.latitude_deg[0]), longitude_deg=float(gnss.longitude_deg[0]),
-        height_m=float(gnss.height_m[0]), easting_m=0, northing_m=0, grid_convergence_rad=0, point_scale=1,
-    )  # fmt: skip
     T_level_odom = pose(level(drive, up), np.zeros(3))
     T: F8 = T_level_odom @ drive.odometry.T_odom_lidar
-    return Motion(drive.odometry.stamp_ns, T, gnss.stamp_ns, positions(gnss, first)[:, :2])
+    return Motion(drive.odometry.stamp_ns, T, gnss.stamp_ns, positions(gnss, middle(gnss))[:, :2])
 
 
 def _corrected(drive: Drive, found: Calibration, offset: bool, arm: bool) -> Drive:
