@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,9 +83,9 @@ def _fixes(graph: Graph, pairs: I8) -> FixRows:
 def reason_counts(reasons: Texts) -> dict[str, int]:
     """How often each reason was given, the most frequent first; what differs in numbers only is counted together."""
     counts: dict[str, int] = {}
-    for reason in reasons:
-        text = without_numbers(str(reason))
-        counts[text] = counts.get(text, 0) + 1
+    for reason, count in Counter(reasons.tolist()).items():
+        text = without_numbers(reason)
+        counts[text] = counts.get(text, 0) + count
     return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
 
 

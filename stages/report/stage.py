@@ -21,7 +21,6 @@ from scanloom.stages.report.factor_table import factor_rows
 from scanloom.stages.report.figures import Figures
 from scanloom.stages.report.loop_graph import loop_graph
 from scanloom.stages.report.map_picture import OVERLAY, PLAIN
-from scanloom.stages.report.marks import fix_positions
 from scanloom.stages.report.tables import headline_cards, metric_tables, tile_rows
 from scanloom.stages.report.templates import render
 from scanloom.stages.report.verdict import Limits, judge
@@ -80,7 +79,7 @@ def report(
         picture=_data_uri(picture.read(PLAIN)),
         overlay=picture.read(OVERLAY).decode(),
         names=list(paths),
-        has_fixes=any(len(points) for points in fix_positions(paths, graph).values()),
+        has_fixes=tile_index.georeference is not None and any(len(rows) for rows in fixes.values()),
         loops=joined,
         charts={name: error_chart(track) for name, track in by_session(error_track).items()},
         fixes={name: fix_track(rows, paths[name]) for name, rows in fixes.items()},
