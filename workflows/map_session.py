@@ -57,6 +57,6 @@ NODES: tuple[Node, ...] = (
     node("overview",   overview,   per="map",     reads=(Tile,),                               writes=(TileIndex, MapFiles)),
     node("evaluation", evaluation, per="map",     reads=(Session, Truth, Odometry, Poses, Loops, Graph, Gnss, Tile, SensorCheck), writes=(Metrics, ErrorTrack)),
     node("picture",    picture,    per="map",     reads=(Poses, Loops, Graph, TileIndex, Tile), writes=PictureFiles),
-    node("report",     report,     per="map",     reads=(Session, Metrics, ErrorTrack, Odometry, Poses, Loops, Graph, TileIndex, PictureFiles, SensorCheck), writes=ReportFiles),
+    node("report",     report,     per="map",     reads=(Session, Metrics, ErrorTrack, Odometry, Poses, Loops, Graph, TileIndex, PictureFiles, SensorCheck, Changes), writes=ReportFiles),
 )
 # fmt: on

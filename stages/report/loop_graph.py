@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,17 +12,13 @@ from scanloom.schemas.loops import Loops
 from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.trajectory import Poses
 from scanloom.stages.geometry.factor_rows import USED, loop_verdicts, reason_counts
-from scanloom.stages.report.overlay import SESSION_COLOURS, round_length
-from scanloom.stages.report.raster import View, fit_view
+from scanloom.stages.report.plan import Plan
+from scanloom.stages.report.raster import View
 
 F8 = NDArray[np.float64]
 
-_WIDTH = 1000
-_MAX_PATH_POINTS = 1500
 _MAX_EDGES = 600
 _MAX_REASONS = 8
-_MARGIN = 0.06
-_LEAST_MARGIN_M = 3.0
 
 USED_WITHIN, USED_BETWEEN, DOUBTED, REFUSED = "within", "between", "doubted", "refused"
 EDGES = {
@@ -84,15 +79,11 @@ def loop_graph(paths: Mapping[str, Poses], loops: Loops, graph: Graph) -> LoopGr
     drawn = np.isfinite(ends).all(axis=(1, 2))
     if not drawn.any():
         return LoopGraph("", "", counts, reasons[:_MAX_REASONS], left)
-    view = _view(paths)
-    bar_m = round_length(view.width * view.pixel_m / 5)
-    body = _tracks(view, paths) + "".join(_edges(view, ends[drawn & (kinds == kind)], kind) for kind in EDGES)
-    svg = (
-        f'<svg viewBox="0 0 {view.width} {view.height}" class="plan" role="img" aria-label="loop graph from above">'
-        f"{body}{_bar(view, bar_m)}</svg>"
+    plan = Plan(paths)
+    marks = "".join(_edges(plan.view, ends[drawn & (kinds == kind)], kind) for kind in EDGES)
+    return LoopGraph(
+        plan.draw(marks, "loop graph from above"), plan.scale, counts, reasons[:_MAX_REASONS], left
     )
-    scale = f"{bar_m / 1000:g} km" if bar_m >= 1000 else f"{bar_m:g} m"
-    return LoopGraph(svg, scale, counts, reasons[:_MAX_REASONS], left)
 
 
 def edge_kinds(loops: Loops, verdicts: NDArray[np.object_]) -> NDArray[np.object_]:
@@ -133,27 +124,6 @@ def loop_ends(paths: Mapping[str, Poses], loops: Loops) -> F8:
     return ends
 
 
-def _view(paths: Mapping[str, Poses]) -> View:
-    corners = np.concatenate([poses.T_world_lidar[:, :2, 3] for poses in paths.values() if len(poses)])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    margin = max(float((high - low).max()) * _MARGIN, _LEAST_MARGIN_M)
-    return fit_view(low, high, margin, _WIDTH, 1e-3)
-
-
-def _tracks(view: View, paths: Mapping[str, Poses]) -> str:
-    parts = []
-    for number, (name, poses) in enumerate(paths.items()):
-        if not len(poses):
-            continue
-        rows = np.unique(
-            np.linspace(0, len(poses) - 1, min(len(poses), _MAX_PATH_POINTS)).round().astype(int)
-        )
-        points = _points(view.pixels(poses.T_world_lidar[rows, :2, 3]))
-        style = f"track track-{number % len(SESSION_COLOURS)}" if len(paths) > 1 else "track"
-        parts.append(f'<polyline points="{points}" class="{style}"><title>{escape(name)}</title></polyline>')
-    return "".join(parts)
-
-
 def _edges(view: View, ends: F8, kind: str) -> str:
     """One path of all edges of a kind; a thinned choice of them when there are very many."""
     if not len(ends):
@@ -166,12 +136,3 @@ def _edges(view: View, ends: F8, kind: str) -> str:
         f'<path d="{path}" class="edge edge-{kind}"><title>{EDGES[kind]}</title></path>'
         f'<path d="{dots}" class="ends edge-{kind}"/>'
     )
-
-
-def _bar(view: View, length_m: float) -> str:
-    x, y = 0.02 * view.width, view.height - 0.02 * view.width
-    return f'<path d="M{x:.1f} {y - 8:.1f}v8h{length_m / view.pixel_m:.1f}v-8" class="bar-line"/>'
-
-
-def _points(xy: F8) -> str:
-    return " ".join(f"{x:.1f},{y:.1f}" for x, y in xy)

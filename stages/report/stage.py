@@ -7,6 +7,7 @@ import base64
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from scanloom.schemas.changes import Changes
 from scanloom.schemas.evaluation import ErrorTrack, Metrics, PictureFiles, ReportFiles
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.pose_graph import Graph
@@ -17,6 +18,7 @@ from scanloom.schemas.tiles import TileIndex
 from scanloom.schemas.trajectory import Odometry, Poses
 from scanloom.stages.geometry.factor_rows import FixRows, fix_rows
 from scanloom.stages.report.along import blind_sessions, error_chart, fix_track
+from scanloom.stages.report.changed import changed
 from scanloom.stages.report.factor_table import factor_rows
 from scanloom.stages.report.figures import Figures
 from scanloom.stages.report.loop_graph import loop_graph
@@ -66,6 +68,7 @@ def report(
     tile_index: TileIndex,
     picture: PictureFiles,
     check: Parts[SensorCheck] | None = None,
+    changes: Changes | None = None,
 ) -> ReportFiles:
     """Judge the map and write the body of the report, to be wrapped by `page.compose`."""
     sessions, paths = by_session(session), by_session(poses)
@@ -85,6 +88,7 @@ def report(
         fixes={name: fix_track(rows, paths[name]) for name, rows in fixes.items()},
         blind=blind_sessions(sessions, by_session(odometry)),
         factors=factor_rows(graph),
+        gone=changed(paths, changes),
         tables=metric_tables(sessions, figures),
         sessions=sessions,
         checks=by_session(check),

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from scanloom.schemas.changes import Changes
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.trajectory import Odometry, Poses
@@ -15,6 +16,7 @@ from scanloom.stages.geometry.factor_rows import fix_rows
 from scanloom.stages.geometry.geodesy import georeference
 from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.report.along import SPARE, FixTrack, blindness, fix_track
+from scanloom.stages.report.changed import changed
 from scanloom.stages.report.factor_table import factor_rows
 from scanloom.stages.report.loop_graph import LoopGraph, loop_graph
 from tests.stages.mapping import fixes_graph, graph_of, loops_of, odometry_of, poses_of, session_of
@@ -217,3 +219,48 @@ def test_factors_are_counted_kind_by_kind_with_the_residuals_of_those_in_use() -
     assert (loop.kind, loop.count, loop.used, loop.before, loop.after) == ("loop", 4, 3, "2 / 2", "2 / 2.9")
     assert (gnss.count, gnss.used, gnss.before, gnss.after) == (2, 0, "–", "–")
     assert factor_rows(Graph.empty()) == []
+
+
+# --- changes ---
+
+
+def changes_of(objects: list[tuple[float, float, int]], sessions: tuple[str, ...] = ("b",)) -> Changes:
+    """Objects as cubes of a metre with so many points at (x, y), mixed with each other."""
+    rng = np.random.default_rng(0)
+    number = rng.permutation(np.repeat(np.arange(len(objects)), [n for *_, n in objects])).astype(np.int32)
+    middle = np.array([(x, y, 0.0) for x, y, _ in objects]).reshape(-1, 3)[number]
+    xyz = middle + rng.uniform(-0.5, 0.5, middle.shape)
+    n = len(number)
+    return Changes(
+        x_m=xyz[:, 0].copy(), y_m=xyz[:, 1].copy(), z_m=xyz[:, 2].copy(), through=np.full(n, 7, np.int32),
+        confirming=np.zeros(n, np.int32), object_=number, sessions=sessions, frame="map", georeference=None,
+    )  # fmt: skip
+
+
+def test_what_is_gone_is_listed_the_largest_first_and_drawn() -> None:
+    found = changed({"a": poses_of(road())}, changes_of([(10.0, 5.0, 40), (60.0, -5.0, 90)]))
+    assert found is not None
+    assert (found.objects, found.points) == (2, 130)
+    assert [gone.points for gone in found.listed] == [90, 40]
+    assert found.listed[0].middle_m == pytest.approx((60.0, -5.0, 0.0), abs=0.1)
+    assert found.listed[0].size_m == pytest.approx((1.0, 1.0, 1.0), abs=0.1)
+    assert found.listed[0].through == 7
+    assert found.svg.count("h0") == 2
+
+
+def test_more_objects_than_a_list_has_room_for_are_all_drawn() -> None:
+    found = changed({"a": poses_of(road())}, changes_of([(5.0 * k, 3.0, 10) for k in range(20)]))
+    assert found is not None
+    assert len(found.listed) == 12
+    assert found.svg.count("h0") == 20
+
+
+def test_nothing_gone_and_nothing_extended_are_two_things() -> None:
+    paths = {"a": poses_of(road())}
+    assert changed(paths, None) is None
+    assert changed(paths, changes_of([], ())) is None
+    looked = changed(paths, changes_of([]))
+    assert looked is not None
+    assert (looked.objects, looked.svg, looked.listed) == (0, "", [])
+    nowhere = Poses.empty(frame="map", georeference=None)
+    assert getattr(changed({"a": nowhere}, changes_of([(1.0, 1.0, 9)])), "svg", None) == ""

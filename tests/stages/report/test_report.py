@@ -43,6 +43,7 @@ from tests.stages.mapping import (
     tiles_of,
     truth_of,
 )
+from tests.stages.report.test_along import changes_of
 from tests.worlds import drive, street
 
 VOID = {"meta", "img", "link", "br", "hr"}
@@ -333,3 +334,13 @@ def test_a_loop_that_the_graph_left_out_is_not_drawn_on_the_map(street_map: Map)
     assert "loop: scan" not in street_map.drawn.read("overlay.svg").decode()
     assert "loop closure" not in page
     assert "passed the tests, left out by the graph: 1" in parse(page).text
+
+
+def test_what_an_extension_no_longer_found_has_a_section_of_its_own(street_map: Map) -> None:
+    gone = changes_of([(10.0, 5.0, 400), (20.0, 5.0, 80)])
+    text = parse(body(street_map.report(changes=gone))).text
+    assert "2 objects of the map that was extended are no longer there" in text
+    assert "480 points that b saw through" in text
+    assert "1.0 × 1.0 × 1.0" in text
+    assert "is still there" in parse(body(street_map.report(changes=changes_of([])))).text
+    assert "What has changed" not in body(street_map.report())

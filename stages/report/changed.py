@@ -1,0 +1,69 @@
+"""What of an extended map is no longer there: where, how large, and how often it was seen through."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.schemas.changes import Changes
+from scanloom.schemas.trajectory import Poses
+from scanloom.stages.report.plan import Plan, drawable
+
+_MOST_LISTED = 12
+
+
+@dataclass(frozen=True)
+class Gone:
+    """One object: middle of its points and their extent (3,), m."""
+
+    middle_m: tuple[float, float, float]
+    size_m: tuple[float, float, float]
+    points: int
+    through: float
+    """Scans that looked through it, in the middle of its points."""
+
+
+@dataclass(frozen=True)
+class Changed:
+    """All objects that are gone, the largest listed; `sessions` are those that looked."""
+
+    sessions: tuple[str, ...]
+    svg: str
+    scale: str
+    objects: int
+    points: int
+    listed: list[Gone]
+
+
+def changed(paths: Mapping[str, Poses], changes: Changes | None) -> Changed | None:
+    """What the new sessions saw through; None for a map that extends none."""
+    if changes is None or not changes.sessions:
+        return None
+    numbers, counts = np.unique(changes.object_, return_counts=True)
+    rows = np.split(np.argsort(changes.object_, kind="stable"), np.cumsum(counts)[:-1])
+    objects = [_gone(changes, part) for part in rows if len(part)]
+    objects.sort(key=lambda gone: -gone.points)
+    svg, scale = _drawn(paths, objects)
+    return Changed(changes.sessions, svg, scale, len(numbers), len(changes), objects[:_MOST_LISTED])
+
+
+def _gone(changes: Changes, rows: NDArray[np.int64]) -> Gone:
+    xyz = np.column_stack((changes.x_m[rows], changes.y_m[rows], changes.z_m[rows]))
+    low, high = xyz.min(axis=0), xyz.max(axis=0)
+    x, y, z = (0.5 * (low + high)).tolist()
+    length, width, height = (high - low).tolist()
+    return Gone((x, y, z), (length, width, height), len(rows), float(np.median(changes.through[rows])))
+
+
+def _drawn(paths: Mapping[str, Poses], objects: list[Gone]) -> tuple[str, str]:
+    """The objects as dots on the tracks, and the length of the scale bar."""
+    if not (objects and drawable(paths)):
+        return "", ""
+    plan = Plan(paths)
+    pixels = plan.view.pixels(np.array([gone.middle_m[:2] for gone in objects]))
+    dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in pixels.tolist())
+    mark = f'<path d="{dots}" class="ends edge-doubted"><title>no longer there</title></path>'
+    return plan.draw(mark, "what has changed, from above"), plan.scale
