@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -14,7 +15,7 @@ from scanloom.schemas.errors import StageError
 from scanloom.schemas.loops import Places
 from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.geometry.se3 import F8, inverse
-from scanloom.stages.loops.position import PositionSettings, accumulated, nearest_earlier
+from scanloom.stages.loops.position import PositionSettings, Whereabouts, accumulated
 from scanloom.stages.loops.scan_context import F4, contexts
 from scanloom.stages.loops.search import Looks, SearchSettings, search
 
@@ -63,8 +64,7 @@ class Track:
     stamp_ns: I8
     T_odom_lidar: F8
     travelled_m: F8
-    spread: F8
-    """(n, 6, 6) covariance of all motions so far, from `position.accumulated`."""
+    whereabouts: Whereabouts
     looks: Looks
 
     def __len__(self) -> int:
@@ -120,28 +120,23 @@ def tracks_of(name: str, odometry: Odometry, places: Places) -> list[Track]:
             odometry.stamp_ns[rows[part]],
             odometry.T_odom_lidar[rows[part]],
             travelled[rows[part]],
-            spread[rows[part]],
-            looks_of(
-                places.descriptor[part],
-                places.beside[part],
-                places.segment_descriptor[part],
-                places.segment_beside[part],
-            ),
+            Whereabouts(odometry.T_odom_lidar[rows[part], :3, 3], spread[rows[part]], travelled[rows[part]]),
+            looks_of(places, part, travelled[rows[part]]),
         )
         for part in parts or [np.zeros(0, np.int64)]
     ]
 
 
-def looks_of(descriptor: F4, beside: F4, segment_descriptor: F4, segment_beside: F4) -> Looks:
-    """Descriptors (n, 20, 60), and (n, 2, 20, 60) from beside, ready to be compared."""
+def looks_of(places: Places, rows: I8, travelled_m: F8) -> Looks:
+    """What the places (n,) in `rows` look like, ready to be compared; `travelled_m` (n,) is the way up to each."""
+    context = _views(places.descriptor[rows], places.beside[rows])
+    segment = _views(places.segment_descriptor[rows], places.segment_beside[rows])
+    return Looks(contexts(context), contexts(segment), np.ascontiguousarray(travelled_m))
 
-    def views(straight: F4, aside: F4) -> tuple[F4, F4, F4]:
-        return straight, aside[:, 0], aside[:, 1]
 
-    return Looks(
-        tuple(contexts(d) for d in views(descriptor, beside)),
-        tuple(contexts(d) for d in views(segment_descriptor, segment_beside)),
-    )
+def _views(straight: F4, beside: F4) -> F4:
+    """(3, n, 20, 60) of (n, 20, 60) and (n, 2, 20, 60)."""
+    return np.concatenate((straight[None], np.swapaxes(beside, 0, 1)))
 
 
 def candidates(settings: CandidateSettings, tracks: Sequence[Track]) -> list[Candidate]:
@@ -199,14 +194,7 @@ def _by_position(settings: CandidateSettings, tracks: Sequence[Track]) -> Iterat
     """For each search position, the nearest earlier keyframe of the same track."""
     for number, track in enumerate(tracks):
         queries, admitted = _asked(settings, track)
-        place, share = nearest_earlier(
-            settings.position,
-            track.T_odom_lidar[:, :3, 3],
-            track.spread,
-            track.travelled_m,
-            queries,
-            admitted,
-        )
+        place, share = track.whereabouts.nearest_earlier(settings.position, queries, admitted)
         for k in np.flatnonzero(place >= 0):
             i, j = int(place[k]), int(queries[k])
             predicted = inverse(track.T_odom_lidar[i]) @ track.T_odom_lidar[j]
@@ -220,8 +208,8 @@ def _by_looks(settings: CandidateSettings, tracks: Sequence[Track]) -> Iterator[
         for a in range(b + 1):
             whole = np.full(len(queries), len(tracks[a]), np.int64)
             found = search(
-                settings.search, tracks[a].looks, track.looks, tracks[a].travelled_m, track.travelled_m, queries,
-                admitted if a == b else whole,
+                settings.search, tracks[a].looks, track.looks, queries, admitted if a == b else whole,
+                partial(track.whereabouts.ruled_out, settings.position) if a == b else None,
             )  # fmt: skip
             for k in np.flatnonzero(found.score <= settings.search.max_distance):
                 i, j, yaw = int(found.place[k]), int(queries[k]), found.heading(int(k))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
@@ -11,6 +13,7 @@ from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8, adjoint
 
 I8 = NDArray[np.int64]
+B1 = NDArray[np.bool_]
 
 
 class PositionSettings(BaseModel):
@@ -35,6 +38,12 @@ class PositionSettings(BaseModel):
         description="standard deviation of odometry's systematic error, which its covariances do not hold, per metre driven",
     )
     max_radius_m: float = Field(default=50.0, gt=0, le=500, description="farther is never near, m")
+    doubt: float = Field(
+        default=2.0,
+        ge=1,
+        le=1000,
+        description="looks count against odometry up to this many times what is near; beyond, a place only looks the same",
+    )
 
 
 def accumulated(odometry: Odometry) -> F8:
@@ -46,49 +55,88 @@ def accumulated(odometry: Odometry) -> F8:
     return np.cumsum(A @ odometry.covariance @ np.swapaxes(A, 1, 2), axis=0)
 
 
-def nearest_earlier(
-    settings: PositionSettings, position_m: F8, spread: F8, travelled_m: F8, queries: I8, admitted: I8
-) -> tuple[I8, F8]:
-    """Of each of the keyframes `queries` (n,), the one nearest in units of what is near among the first `admitted` (n,).
+@dataclass(frozen=True)
+class Whereabouts:
+    """Where odometry puts the keyframes (n,) of one track, and how well it knows."""
 
-    Returns its number, -1 where none is near, and the distance in these units, below 1.
+    position_m: F8
+    """(n, 3)"""
+    spread: F8
+    """(n, 6, 6) from `accumulated`."""
+    travelled_m: F8
 
-    Parameters
-    ----------
-    position_m : (k, 3) by odometry.
-    spread : (k, 6, 6) from `accumulated`.
-    """
-    place, share = np.full(len(queries), -1, np.int64), np.ones(len(queries))
-    limits = np.array(
-        [settings.radius_m, settings.height_m, settings.sigmas, settings.drift_share, settings.max_radius_m]
-    )
-    _nearest(
-        np.ascontiguousarray(position_m), np.ascontiguousarray(spread), np.ascontiguousarray(travelled_m), queries,
-        admitted, limits, place, share,
+    def nearest_earlier(self, settings: PositionSettings, queries: I8, admitted: I8) -> tuple[I8, F8]:
+        """Of each of the keyframes `queries` (m,), the nearest of the first `admitted` (m,), in units of what is near.
+
+        Returns its number, -1 where none is near, and the distance in these units, below 1.
+        """
+        place, share = np.full(len(queries), -1, np.int64), np.ones(len(queries))
+        _nearest(*self._arrays(), queries, admitted, _limits(settings), place, share)
+        return place, share
+
+    def ruled_out(self, settings: PositionSettings, i: I8, j: I8) -> B1:
+        """Which pairs of keyframes, arrays of one shape, are farther apart than `doubt` times what is near."""
+        out = np.zeros(i.size, np.bool_)
+        _far(
+            *self._arrays(),
+            np.ascontiguousarray(i.ravel()),
+            np.ascontiguousarray(j.ravel()),
+            _limits(settings),
+            out,
+        )
+        return out.reshape(i.shape)
+
+    def _arrays(self) -> tuple[F8, F8, F8]:
+        return tuple(np.ascontiguousarray(a) for a in (self.position_m, self.spread, self.travelled_m))  # type: ignore[return-value]
+
+
+def _limits(settings: PositionSettings) -> F8:
+    return np.array(
+        [
+            settings.radius_m, settings.height_m, settings.sigmas, settings.drift_share, settings.max_radius_m,
+            settings.doubt,
+        ]
     )  # fmt: skip
-    return place, share
 
 
 @kernel
 def _nearest(
     p: F8, spread: F8, travelled: F8, queries: I8, admitted: I8, limits: F8, place: I8, share: F8
 ) -> None:  # fmt: skip
-    radius, height, sigmas, drift, most = limits[0], limits[1], limits[2], limits[3], limits[4]
+    most = limits[4]
     for q in range(len(queries)):
         j = queries[q]
         i = 0
         while i < admitted[q]:
-            flat = np.sqrt((p[j, 0] - p[i, 0]) ** 2 + (p[j, 1] - p[i, 1]) ** 2)
+            flat = np.hypot(p[j, 0] - p[i, 0], p[j, 1] - p[i, 1])
             if flat > most:  # no nearer one before this much path
                 i = max(i + 1, np.searchsorted(travelled, travelled[i] + flat - most))
                 continue
-            level, up = _variances(spread[j] - spread[i], p[j])
-            systematic = (drift * (travelled[j] - travelled[i])) ** 2
-            near = min(max(radius, sigmas * np.sqrt(level + systematic)), most)
-            tall = max(height, sigmas * np.sqrt(up + systematic))
+            near, tall = _near(p, spread, travelled, i, j, limits)
+            near = min(near, most)
             if flat < near * share[q] and abs(p[j, 2] - p[i, 2]) < tall:
                 place[q], share[q] = i, flat / near
             i += 1
+
+
+@kernel
+def _far(p: F8, spread: F8, travelled: F8, i: I8, j: I8, limits: F8, out: B1) -> None:
+    for k in range(len(i)):
+        near, tall = _near(p, spread, travelled, i[k], j[k], limits)
+        flat = np.hypot(p[j[k], 0] - p[i[k], 0], p[j[k], 1] - p[i[k], 1])
+        out[k] = flat > limits[5] * near or abs(p[j[k], 2] - p[i[k], 2]) > limits[5] * tall
+
+
+@kernel
+def _near(p: F8, spread: F8, travelled: F8, i: int, j: int, limits: F8) -> tuple[float, float]:
+    """Horizontal and vertical distance, m, that count as near."""
+    first, last = min(i, j), max(i, j)
+    level, up = _variances(spread[last] - spread[first], p[last])
+    systematic = (limits[3] * (travelled[last] - travelled[first])) ** 2
+    return (
+        max(limits[0], limits[2] * np.sqrt(level + systematic)),
+        max(limits[1], limits[2] * np.sqrt(up + systematic)),
+    )
 
 
 @kernel

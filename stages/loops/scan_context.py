@@ -44,38 +44,37 @@ def scan_context(
 
 @dataclass(frozen=True)
 class Contexts:
-    """Descriptors (n, 20, 60) in the form in which they are compared."""
+    """Descriptors (..., 20, 60) in the form in which they are compared."""
 
     column: I2
-    """(n, sectors, rings) columns of length 4095, or 0 where empty."""
+    """(..., sectors, rings) columns of length 4095, or 0 where empty."""
     sector_key: F4
-    """(n, sectors) mean height of each column, m."""
+    """(..., sectors) mean height of each column, m."""
     ring_key: F4
-    """(n, rings) mean height of each ring, m: the same from every heading."""
-
-    def __len__(self) -> int:
-        return len(self.column)
+    """(..., rings) mean height of each ring, m: the same from every heading."""
 
 
 def contexts(descriptor: F4) -> Contexts:
-    """What comparing takes of descriptors (n, 20, 60)."""
-    length = np.linalg.norm(descriptor, axis=1, keepdims=True)
+    """What comparing takes of descriptors (..., 20, 60)."""
+    length = np.linalg.norm(descriptor, axis=-2, keepdims=True)
     unit = np.where(length > 0, descriptor / np.maximum(length, np.float32(1e-9)), np.float32(0))
     return Contexts(
-        np.ascontiguousarray(np.swapaxes(np.round(LENGTH * unit), 1, 2).astype(np.int16)),
-        np.ascontiguousarray(descriptor.mean(axis=1), np.float32),
-        np.ascontiguousarray(descriptor.mean(axis=2), np.float32),
+        np.ascontiguousarray(np.swapaxes(np.round(LENGTH * unit), -1, -2).astype(np.int16)),
+        np.ascontiguousarray(descriptor.mean(axis=-2), np.float32),
+        np.ascontiguousarray(descriptor.mean(axis=-1), np.float32),
     )
 
 
-def descriptor_distance(descriptor_i: F4, descriptor_j: F4, shift_share: float = 1.0) -> tuple[float, float]:
+def descriptor_distance(
+    descriptor_i: F4, descriptor_j: F4, shift_share: float = 0.5, alignments: int = 1
+) -> tuple[float, float]:
     """Scan context distance (0 same, 1 different) and the heading of j in i, rad, of two descriptors (20, 60).
 
-    Sector keys are aligned first; column shifts within +-`shift_share` / 2 of a turn around that are tested.
+    Column shifts within `shift_share` of a turn on either side of the best `alignments` of the sector keys are tested.
     """
-    i, j = contexts(descriptor_i[None]), contexts(descriptor_j[None])
+    i, j = contexts(descriptor_i), contexts(descriptor_j)
     distance, shift = best_distance(
-        i.column[0], j.column[0], i.sector_key[0], j.sector_key[0], shifts_beside(2 * shift_share / 2)
+        i.column, j.column, i.sector_key, j.sector_key, shifts_beside(shift_share), alignments
     )
     return float(distance), heading_of(shift)
 
@@ -91,23 +90,30 @@ def heading_of(shift: int) -> float:
 
 
 @kernel
-def best_distance(column_i: I2, column_j: I2, sector_i: F4, sector_j: F4, beside: int) -> tuple[float, int]:
-    """Smallest distance over the shifts around that of the best aligned sector keys, and its shift.
+def best_distance(
+    column_i: I2, column_j: I2, sector_i: F4, sector_j: F4, beside: int, alignments: int
+) -> tuple[float, int]:
+    """Smallest distance over the shifts around those that align the sector keys best, and its shift.
 
     Column s of i faces column s - shift of j. All shifts when `beside` is half a turn.
     """
     sectors = len(sector_i)
-    middle: Int = 0
-    if 2 * beside < sectors:
-        least = np.inf
-        for shift in range(sectors):
-            total = 0.0
-            for s in range(sectors):
-                e = sector_i[s] - sector_j[s - shift]  # negative indices count from the end
-                total += e * e
-            if total < least:
-                least, middle = total, shift
-    return distance_around(column_i, column_j, middle, beside)
+    if 2 * beside >= sectors:
+        return distance_around(column_i, column_j, 0, beside)
+    apart = np.zeros(sectors)
+    for shift in range(sectors):
+        for s in range(sectors):
+            e = sector_i[s] - sector_j[s - shift]  # negative indices count from the end
+            apart[shift] += e * e
+    best, best_shift = 2.0, 0
+    for _ in range(alignments):
+        middle = int(np.argmin(apart))
+        distance, shift = distance_around(column_i, column_j, middle, beside)
+        if distance < best:
+            best, best_shift = distance, shift
+        for k in range(-beside, beside + 1):
+            apart[(middle + k) % sectors] = np.inf
+    return best, best_shift
 
 
 @kernel

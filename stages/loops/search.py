@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -30,6 +30,8 @@ from scanloom.stages.loops.scan_context import (
 )
 
 I8 = NDArray[np.int64]
+B1 = NDArray[np.bool_]
+RuledOut = Callable[[I8, I8], B1]
 
 
 class SearchSettings(BaseModel):
@@ -56,7 +58,13 @@ class SearchSettings(BaseModel):
         default=0.05,
         ge=0,
         le=1,
-        description="column shifts tested on either side of where the sector keys align, share of the turn",
+        description="column shifts tested on either side of where sector keys align, share of the turn",
+    )
+    alignments: int = Field(
+        default=3,
+        ge=1,
+        le=60,
+        description="alignments of the sector keys around which they are tested, the best first, number",
     )
     temporal_frames: int = Field(
         default=2, ge=0, le=20, description="N_t: places before and after that must be alike, too, number"
@@ -78,14 +86,19 @@ class SearchSettings(BaseModel):
 
 @dataclass(frozen=True)
 class Looks:
-    """Descriptors of the keyframes of one track: of all that stands there, and of segments; both also from beside."""
+    """Keyframes of one track: descriptors of all that stands there and of segments, and the way driven."""
 
-    context: tuple[Contexts, ...]
-    """As seen from the LiDAR, from the lane to its left, from that to its right."""
-    segment: tuple[Contexts, ...]
+    context: Contexts
+    """(lanes, n, ...): as seen from the LiDAR, from the lane to its left, from that to its right."""
+    segment: Contexts
+    path_m: F8
 
     def __len__(self) -> int:
-        return len(self.context[0])
+        return len(self.path_m)
+
+    @property
+    def lanes(self) -> int:
+        return len(self.context.column)
 
 
 @dataclass(frozen=True)
@@ -115,33 +128,32 @@ def search(
     settings: SearchSettings,
     old: Looks,
     new: Looks,
-    old_path_m: F8,
-    new_path_m: F8,
     queries: I8,
     admitted: I8,
+    ruled_out: RuledOut | None = None,
 ) -> Matches:
     """For each of the keyframes `queries` (n,) of `new`, the best of the first `admitted` (n,) keyframes of `old`.
 
-    Parameters
-    ----------
-    old_path_m, new_path_m : way driven up to each keyframe, m.
+    `ruled_out` says of pairs (i, j), any shape, which cannot be one place whatever they look like.
     """
-    lanes = len(new.context)
-    forest = Forest(old.context[0].ring_key, settings.rebuild_keyframes)
-    near = [
-        forest.nearest(new.context[k].ring_key[queries], admitted, settings.neighbours) for k in range(lanes)
-    ]
+    forest = Forest(old.context.ring_key[0], settings.rebuild_keyframes)
+    keys = new.context.ring_key[:, queries]
+    near = [forest.nearest(of_lane, admitted, settings.neighbours) for of_lane in keys]
     candidates = np.ascontiguousarray(np.concatenate(near, axis=1))
-    lane = np.repeat(np.arange(lanes), settings.neighbours)
+    lane = np.repeat(np.arange(new.lanes), settings.neighbours)
+    impossible = candidates < 0
+    if ruled_out is not None:
+        impossible |= ruled_out(
+            np.maximum(candidates, 0), np.broadcast_to(queries[:, None], candidates.shape)
+        )
     out = _Out(len(queries))
     steps: F8 = settings.temporal_step_m * np.arange(1, settings.temporal_frames + 1, dtype=float)
-    around_old, around_new = _around(old_path_m, steps), _around(new_path_m, steps)
     _three_stages(
-        old.context[0].column, old.context[0].sector_key, old.segment[0].column,
-        np.stack([c.column for c in new.context]), np.stack([c.sector_key for c in new.context]),
-        np.stack([c.column for c in new.segment]), queries, candidates, lane, around_old, around_new,
-        shifts_beside(settings.shift_share), settings.temporal_margin, settings.max_segment_distance,
-        out.place, out.shift, out.numbers,
+        old.context.column[0], old.context.sector_key[0], old.segment.column[0], new.context.column,
+        new.context.sector_key, new.segment.column, queries, candidates, lane, _around(old.path_m, steps),
+        _around(new.path_m, steps), shifts_beside(settings.shift_share), settings.alignments,
+        impossible, settings.temporal_margin, settings.max_segment_distance, out.place,
+        out.shift, out.numbers,
     )  # fmt: skip
     distance, temporal, segment, score = np.ascontiguousarray(out.numbers.T)
     return Matches(out.place, out.shift, distance, temporal, segment, score)
@@ -239,7 +251,7 @@ def _runs(count: int) -> Sequence[tuple[int, int]]:
 @kernel
 def _three_stages(
     old: I2, old_key: F4, old_segment: I2, new: I2, new_key: F4, new_segment: I2, queries: I8, candidates: I8, lane: I8,
-    around_old: I8, around_new: I8, beside: int, margin: float, most: float, place: I8, shift: I8, numbers: F8,
+    around_old: I8, around_new: I8, beside: int, alignments: int, impossible: B1, margin: float, most: float, place: I8, shift: I8, numbers: F8,
 ) -> None:  # fmt: skip
     """`new*` have lanes first. The match of the smallest score, d, or max(d, t - margin) where segments do not outweigh t."""
     count = candidates.shape[1]
@@ -249,11 +261,13 @@ def _three_stages(
         for k in range(count):
             i = candidates[q, k]
             d[k], s[k] = 2.0, 0
-            if i >= 0:
-                d[k], s[k] = best_distance(old[i], new[lane[k], j], old_key[i], new_key[lane[k], j], beside)
+            if not impossible[q, k]:
+                d[k], s[k] = best_distance(
+                    old[i], new[lane[k], j], old_key[i], new_key[lane[k], j], beside, alignments
+                )
         for k in np.argsort(d, kind="mergesort"):
             i = candidates[q, k]
-            if i < 0 or d[k] >= min(numbers[q, 3], 1.0):
+            if d[k] >= min(numbers[q, 3], 1.0):
                 break
             t = _temporal(old, new[lane[k]], around_old[i], around_new[j], s[k], beside)
             score, segment = d[k], np.nan
