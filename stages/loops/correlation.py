@@ -26,7 +26,7 @@ I4 = NDArray[np.int32]
 YAW_STEP_RAD = np.radians(2.0)
 APART_CELLS2, APART_STEPS = 4, 2
 """A peak beats all poses within 1 m (2 cells) and 5 degrees (2 steps) of it."""
-MOST_COLUMNS = 768
+MOST_COLUMNS = 384
 BOUND_BIT, BOX_BIT, LEVEL_BIT, INDEX_MASK = 45, 44, 41, (1 << 41) - 1
 """A key of the queue: bound, 1 unless a single pose, level, complement of the index. The largest is first in it."""
 
@@ -70,8 +70,10 @@ class Peak:
     T_i_j: F8
     score: float
 
-def peaks(grid: U8, low_m: float, points: F8, prior: Prior, most: int, least_share: float) -> list[Peak]:
-    """The best peaks, best first: at most `most`, none below `least_share` of the best; none when nothing meets.
+def peaks(
+    grid: U8, low_m: float, points: F8, prior: Prior, most: int, least_share: float, least_score: float
+) -> list[Peak]:
+    """The best peaks, best first: at most `most`, none below `least_share` of the best, nor below `least_score`.
 
     `grid` is a `pyramid` of i over `low_m`; `points` (n, 3) are those of j that count, in its own level frame, m.
     """
@@ -81,7 +83,9 @@ def peaks(grid: U8, low_m: float, points: F8, prior: Prior, most: int, least_sha
     full = 2 * sum(int(b).bit_count() for b in bits)
     yaws = prior.yaws_rad
     cells = _turned(xy, yaws, prior)
-    found, scores = _search(grid, cells, bits, reach, reach_z, prior.all_around, most, least_share)
+    found, scores = _search(
+        grid, cells, bits, reach, reach_z, prior.all_around, most, least_share, max(1, int(np.ceil(least_score * full)))
+    )  # fmt: skip
     out = []
     for (a, x, y, z), value in zip(found, scores, strict=True):
         shift = np.array([x - reach, y - reach, z - reach_z]) * CELL_M
@@ -100,14 +104,14 @@ def _turned(xy: F8, yaws: F8, prior: Prior) -> I4:
 
 @kernel
 def _search(
-    grid: U8, cells: I4, bits: U8, reach: Int, reach_z: Int, around: bool, most: Int, least_share: Float
+    grid: U8, cells: I4, bits: U8, reach: Int, reach_z: Int, around: bool, most: Int, least_share: Float, least: Int
 ) -> tuple[I8, I8]:  # fmt: skip
     """Places (k, 4) of the peaks in the window (heading, x, y, z) and their scores (k,), best first."""
     window = np.array([len(cells), 2 * reach + 1, 2 * reach + 1, 2 * reach_z + 1])
     gone = np.zeros((window[0], window[1], window[2], window[3]), np.bool_)
     found, scores = np.empty((most, 4), np.int64), np.empty(most, np.int64)
-    peaks, least = 0, 1
-    queue, waiting = _roots(grid, cells, bits, reach, reach_z, window)
+    peaks = 0
+    queue, waiting = _roots(grid, cells, bits, reach, reach_z, window, least)
     while waiting > 0 and peaks < most:
         key = _first(queue, waiting)
         waiting -= 1
@@ -129,7 +133,7 @@ def _search(
 
 
 @kernel
-def _roots(grid: U8, cells: I4, bits: U8, reach: Int, reach_z: Int, window: I8) -> tuple[I8, Int]:
+def _roots(grid: U8, cells: I4, bits: U8, reach: Int, reach_z: Int, window: I8, least: Int) -> tuple[I8, Int]:
     """A queue of the largest boxes, which fill the window."""
     queue, waiting = np.empty(1 << 14, np.int64), 0
     step = 1 << TOP_LEVEL
@@ -138,7 +142,7 @@ def _roots(grid: U8, cells: I4, bits: U8, reach: Int, reach_z: Int, window: I8) 
             for y in range(0, window[2], step):
                 for z in range(0, window[3], step):
                     bound = score(grid[TOP_LEVEL], cells[a], bits, x - reach, y - reach, z - reach_z)
-                    if bound > 0:
+                    if bound >= least:
                         queue, waiting = _wait(queue, waiting, _key(bound, TOP_LEVEL, a, x, y, z, window))
     return queue, waiting
 

@@ -16,6 +16,8 @@ TALLER_THAN_A_CAR_M = 2.2
 """Cars, people and cyclists stay below: what stands higher is there on another day as well."""
 UPRIGHT_M = 0.5
 DISPLACED_M = 1.5
+SEEN_M = 3.0
+"""Edge of a column in which one point tells that a submap saw what is there."""
 
 
 def upright(submap: Submap, above_ground_m: float = UPRIGHT_M) -> F8:
@@ -44,6 +46,12 @@ def overlap(i: Submap, j: Submap, T_i_j: F8, voxel_size_m: float) -> float:
     """Share of voxels of j that i also fills."""
     of_j = np.unique(voxel_keys(transform(T_i_j, j.points), voxel_size_m))
     return float(np.isin(of_j, voxel_keys(i.points, voxel_size_m)).mean()) if len(of_j) else 0.0
+
+
+def comparable(i: Submap, points: F8) -> NDArray[np.bool_]:
+    """Which of `points` (n, 3) in the frame of i lie where i saw something, ground or not: in one of its filled columns."""
+    flat = np.array([1.0, 1.0, 0.0])
+    return np.isin(voxel_keys(points * flat, SEEN_M), voxel_keys(i.points * flat, SEEN_M))
 
 
 def displaced(target: VoxelMap, points: F8, distance_m: float) -> tuple[float, float]:

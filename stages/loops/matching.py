@@ -51,6 +51,9 @@ class MatchingSettings(BaseModel):
     least_share: float = Field(
         default=0.6, gt=0, le=1, description="peaks below this share of the best score are not refined"
     )
+    least_score: float = Field(
+        default=0.3, ge=0, le=1, description="peaks below this share of a perfect score are not refined"
+    )
     inlier_distance_m: float = Field(
         default=0.3, gt=0, le=5, description="a point with a partner this near is an inlier, m"
     )
@@ -86,20 +89,24 @@ class Match:
         return self.fit * (1.0 - self.seen_through)
 
 
-def prior_of(settings: MatchingSettings, predicted: F8 | None, i: Submap, j: Submap) -> Prior:
-    """Where j is looked for: around odometry's pose if that is near, else at the same place with any heading.
+def prior_of(
+    settings: MatchingSettings, predicted: F8 | None, seen_yaw_rad: float, i: Submap, j: Submap
+) -> Prior:
+    """Where j is looked for: around odometry's pose, but not farther than the window from i, since places are near.
 
-    `predicted` is T_i_j of the LiDARs. What odometry says from farther away is a place it drifted from.
+    `predicted` is T_i_j of the LiDARs, None where odometry tells nothing; `seen_yaw_rad` the heading by descriptors, or NaN.
+    All headings are searched without odometry, and where descriptors contradict it.
     """
-    if predicted is not None:
-        T = inverse(i.T_lidar_level) @ predicted @ j.T_lidar_level
-        if np.hypot(T[0, 3], T[1, 3]) <= settings.reach_m:
-            x, y, z = T[:3, 3]
-            return Prior(
-                x, y, z, float(yaw_of(T)), settings.reach_m, settings.reach_z_m, np.radians(settings.reach_yaw_deg)
-            )  # fmt: skip
-    z = _ground_z(i) - _ground_z(j)
-    return Prior(0.0, 0.0, z, 0.0, settings.reach_m, settings.reach_z_m, np.pi)
+    reach_yaw = np.radians(settings.reach_yaw_deg)
+    if predicted is None:
+        z = _ground_z(i) - _ground_z(j)
+        return Prior(0.0, 0.0, z, 0.0, settings.reach_m, settings.reach_z_m, np.pi)
+    T = inverse(i.T_lidar_level) @ predicted @ j.T_lidar_level
+    yaw = float(yaw_of(T))
+    if np.isfinite(seen_yaw_rad) and abs((seen_yaw_rad - yaw + np.pi) % (2 * np.pi) - np.pi) > reach_yaw:
+        reach_yaw = np.pi
+    x, y = T[:2, 3] * min(1.0, settings.reach_m / max(float(np.hypot(T[0, 3], T[1, 3])), 1e-9))
+    return Prior(float(x), float(y), float(T[2, 3]), yaw, settings.reach_m, settings.reach_z_m, reach_yaw)
 
 
 def proposals(settings: MatchingSettings, i: Submap, j: Submap, prior: Prior) -> list[Peak]:
@@ -110,7 +117,9 @@ def proposals(settings: MatchingSettings, i: Submap, j: Submap, prior: Prior) ->
     grid = pyramid(np.vstack((upright(i), i.points[i.ground])), low)
     ground = j.points[j.ground]
     moving = np.vstack((upright(j), ground[downsample(ground, GROUND_SPACING_M)]))
-    return peaks(grid, low, moving, prior, settings.peaks, settings.least_share)
+    return peaks(
+        grid, low, moving, prior, settings.peaks, settings.least_share, settings.least_score
+    )
 
 
 def refined(settings: MatchingSettings, target: Target, j: Submap, found: Sequence[Peak]) -> list[Match]:

@@ -17,7 +17,7 @@ from scanloom.stages.geometry.registration import Registration, VoxelMap
 from scanloom.stages.geometry.se3 import F8, inverse, se3_log, transform
 from scanloom.stages.geometry.voxels import downsample
 from scanloom.stages.loops.candidates import Candidate
-from scanloom.stages.loops.indicators import displaced, inliers, overlap
+from scanloom.stages.loops.indicators import comparable, displaced, inliers, overlap
 from scanloom.stages.loops.matching import Match, MatchingSettings, Target, fine, prior_of, proposals, refined
 from scanloom.stages.loops.submaps import Submap
 
@@ -31,10 +31,10 @@ class VerificationSettings(MatchingSettings):
     """How a loop is measured and what it must pass."""
 
     max_distance_m: float = Field(
-        default=12.0, gt=0, le=100, description="loops between poses farther apart are rejected, m"
+        default=20.0, gt=0, le=100, description="loops between poses farther apart are rejected, m"
     )
     min_inlier_ratio: float = Field(
-        default=0.55, ge=0, le=1, description="share of submap j with a partner, at least"
+        default=0.55, ge=0, le=1, description="share of submap j with a partner, of what i saw as well, at least"
     )
     min_structure_ratio: float = Field(
         default=0.35, ge=0, le=1, description="the same of points that are not ground"
@@ -126,7 +126,7 @@ class Evidence:
 
 def verify(settings: VerificationSettings, c: Candidate, path_m: float, i: Submap, j: Submap) -> Verdict:
     """Pose of LiDAR j in LiDAR i and whether to believe it. `path_m` is the path driven in between (0 between sessions)."""
-    found = proposals(settings, i, j, prior_of(settings, c.predicted, i, j))
+    found = proposals(settings, i, j, prior_of(settings, c.predicted, c.yaw_rad, i, j))
     if not found:
         return _nothing("nothing upright to compare")
     target = Target(i)
@@ -148,8 +148,11 @@ def _nothing(reason: str) -> Verdict:
 def _evidence(settings: VerificationSettings, matches: list[Match], target: Target, j: Submap) -> Evidence:
     best = matches[0]
     thin = downsample(j.points, 0.6)
-    inlier = inliers(target.fine, transform(best.T, j.points[thin]), settings.inlier_distance_m)
-    structure = inlier[~j.ground[thin]]
+    moved, ground = transform(best.T, j.points[thin]), j.ground[thin]
+    seen = comparable(target.submap, moved)
+    moved, ground = moved[seen], ground[seen]
+    inlier = inliers(target.fine, moved, settings.inlier_distance_m)
+    structure = inlier[~ground]
     rival, rival_m = 0.0, 0.0
     if len(matches) > 1 and best.quality > 0:
         rival = matches[1].quality / best.quality
@@ -157,7 +160,7 @@ def _evidence(settings: VerificationSettings, matches: list[Match], target: Targ
     return Evidence(
         match=best,
         T_i_j=target.submap.T_lidar_level @ best.T @ inverse(j.T_lidar_level),
-        inlier_ratio=float(inlier.mean()),
+        inlier_ratio=float(inlier.mean()) if len(inlier) else 0.0,
         structure_ratio=float(structure.mean()) if len(structure) else 0.0,
         overlap=overlap(target.submap, j, best.T, settings.overlap_voxel_m),
         seen=judge(best.registration),
