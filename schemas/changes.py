@@ -23,6 +23,9 @@ class Changes(Table):
     through: NDArray[np.int32] = column("i4", "scans of the new sessions that saw through it")
     confirming: NDArray[np.int32] = column("i4", "scans of the new sessions with a return on it")
     object_: NDArray[np.int32] = column("i4", "number of the object it belongs to, from 0, largest first")
+    remnants: int = attribute(
+        "points missed, too, that the old sessions had seen through themselves: what moving things left in the map"
+    )
     sessions: tuple[str, ...] = attribute("the new sessions")
     frame: str = attribute("`world` or `map`")
     georeference: dict[str, Any] | None = attribute("fields of `frames.Georeference`, or null")

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
+
+F8 = NDArray[np.float64]
+I4 = NDArray[np.int32]
 
 
 class Settings(BaseModel):
@@ -11,7 +16,7 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     max_range_m: float = Field(
-        40.0, ge=5.0, le=200.0, description="scans say nothing of points farther away, m"
+        30.0, ge=5.0, le=200.0, description="scans say nothing of points farther away, m"
     )
     thinning_m: float = Field(
         0.2, ge=0.05, le=2.0, description="one point of the old map is asked per voxel of this edge, m"
@@ -39,7 +44,27 @@ class Settings(BaseModel):
         le=1.0,
         description="confirming scans, as a share of those that saw through, up to which it is gone",
     )
+    max_through_before: float = Field(
+        0.25,
+        ge=0.0,
+        le=1.0,
+        description="scans of the old sessions that saw through, as a share of those that confirmed, up to which it stood then",
+    )
     link_m: float = Field(
         0.6, ge=0.1, le=5.0, description="points nearer to each other than this are one object, m"
     )
     min_points: int = Field(12, ge=1, le=10_000, description="points an object needs to be reported")
+
+    def limits(self) -> F8:
+        """What `rays.judge` asks for."""
+        return np.array(
+            [self.max_range_m, self.margin_m, self.margin_share, self.ray_m, self.guard_m, self.confirm_m]
+        )
+
+    def missed(self, through: I4, confirming: I4) -> NDArray[np.bool_]:
+        """Whether new scans with these counts (n,) say that nothing is there."""
+        return np.asarray((through >= self.min_scans) & (confirming <= self.max_confirming * through))
+
+    def stood(self, through: I4, confirming: I4) -> NDArray[np.bool_]:
+        """Whether old scans with these counts (n,) say that something stood there."""
+        return np.asarray((confirming >= self.min_scans) & (through <= self.max_through_before * confirming))
