@@ -243,7 +243,7 @@ def _warnings(result: Result) -> list[str]:
         for problem in session.problems
         if problem.severity != "info"
     ]
-    return of_logs + [remark for graph in result.parts(Graph) for remark in graph.remarks]
+    return of_logs + [text for graph in result.parts(Graph) for text in graph.warnings]
 
 
 def _place(task: Any) -> str:

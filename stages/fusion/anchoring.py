@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from scanloom.schemas.errors import StageError
 from scanloom.stages.fusion.bridging import Bridge
 from scanloom.stages.fusion.drives import Drive
 from scanloom.stages.fusion.links import Link
+from scanloom.stages.fusion.untied import Untied
 from scanloom.stages.geometry.se3 import F8, inverse, se3_log
 
 SAME_PLACE_M = 3.0
@@ -17,15 +17,17 @@ SAME_HEADING_RAD = np.radians(10.0)
 
 
 def anchor(
-    drives: Sequence[Drive], placed: Mapping[int, F8], found: Sequence[Link], gaps: Sequence[Bridge]
-) -> dict[int, F8]:
+    drives: Sequence[Drive], placed: Mapping[int, F8], found: Sequence[Link], gaps: Sequence[Bridge], *,
+    anywhere: bool = True,
+) -> dict[int, F8]:  # fmt: skip
     """Pose (4, 4) of every drive's frame `odom` in the map, spreading from the `placed` ones along loops.
 
-    A segment that no loop reaches follows the one before it or after it by the bridge between them.
+    A segment that no loop reaches follows the one before it or after it by the bridge between them. `anywhere` says
+    whether the placed ones have their place by more than being first.
 
     Raises
     ------
-    StageError : a session has neither GNSS nor loops that tie it to the others.
+    Untied : a session has neither GNSS nor loops that tie it to the others.
     """
     start = dict(placed)
     while len(start) < len(drives):
@@ -34,11 +36,7 @@ def anchor(
         by_bridges = {d: p for d in waiting if (p := _beyond(drives, start, gaps, d))}
         reached = by_loops or by_bridges
         if not reached:
-            raise StageError(
-                "nothing ties this session to the others: it has no usable GNSS and no loop to them was accepted",
-                where=f"session {drives[waiting[0]].name}",
-                next_step="map it on its own, or add a session that overlaps both",
-            )
+            raise Untied.of([drives[d].name for d in waiting], anywhere=anywhere)
         d = min(reached)
         start[d] = _most_supported(reached[d])
     return start

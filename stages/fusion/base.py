@@ -10,7 +10,7 @@ count these as often as there are keyframes. Spans that hardly move stay as they
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,6 +43,10 @@ class BaseMap:
 
     def holds(self, session: str) -> bool:
         return session in self.sessions
+
+    def new_among(self, sessions: Iterable[str]) -> frozenset[str]:
+        """Those of `sessions` that the map does not hold."""
+        return frozenset(sessions) - self.sessions.keys()
 
 
 def base_map(base: Parts[Base] | None) -> BaseMap | None:

@@ -22,7 +22,7 @@ from scanloom.schemas.tracks import Gnss, Imu, Wheel
 from scanloom.schemas.trajectory import Odometry, Poses
 from scanloom.stages.fusion.anchoring import anchor
 from scanloom.stages.fusion.assembly import assembled, odometers_of
-from scanloom.stages.fusion.base import base_map
+from scanloom.stages.fusion.base import BaseMap, base_map
 from scanloom.stages.fusion.bridging import bridges, guessed
 from scanloom.stages.fusion.drives import Drive, gather
 from scanloom.stages.fusion.extending import final, held, on_base, on_ties
@@ -35,6 +35,7 @@ from scanloom.stages.fusion.settings import Settings
 from scanloom.stages.fusion.solving import marginals, solve
 from scanloom.stages.fusion.spreading import poses_of
 from scanloom.stages.fusion.tuning import tuned
+from scanloom.stages.fusion.untied import Untied, left_out, loops_among, those_tied
 
 __all__ = ["VERSION", "Settings", "fusion"]
 
@@ -56,23 +57,36 @@ def fusion(
 
     The frame is `world` (east, north, up at the first accepted fix) when at least one session's GNSS tells its place
     and heading, else `map` (z up, origin at the first scan of the first session). Of a map that is extended it stays.
+    A session that nothing ties to the others is left out with a warning.
 
     Raises
     ------
-    StageError : a session has no odometry, or nothing ties it to the others.
+    StageError : a session has no odometry, or sessions of which none has a place are not tied to each other.
     """
     drives = list(gather(session, odometry, gnss, imu, wheel, check))
     if not drives:
         raise StageError("there is no session to fuse", next_step="add a session to the map")
+    old = base_map(base)
+    try:
+        yield from _fused(settings, drives, loops, old)
+    except Untied as lost:
+        new = old.new_among(d.name for d in drives) if old else frozenset[str]()
+        rest = those_tied(drives, links(drives, loops), lost, new)
+        yield from _fused(settings, rest, loops_among(rest, loops), old, left_out(drives, rest))
+
+
+def _fused(
+    settings: Settings, drives: Sequence[Drive], loops: Loops, old: BaseMap | None, warned: Sequence[str] = ()
+) -> Iterator[Part[Poses] | Graph]:
+    """Poses of these drives, one part per session, then the graph."""
     ups = [gravity(d, settings.gravity_spacing_m) for d in drives]
     drives, told = tuned(settings.gnss, drives, ups)
     odometers = odometers_of(settings, drives)
     gaps = bridges(drives, odometers)
-    old = base_map(base)
     origin, fixes = place_by_gnss(settings, drives, ups, old)
     found = links(drives, loops)
     anchored, fixed = on_base(drives, old)
-    starts = anchor(anchored, placed(drives, ups, fixes, fixed), found, gaps)
+    starts = anchor(anchored, placed(drives, ups, fixes, fixed), found, gaps, anywhere=bool(origin or old))
     nodes = np.concatenate([starts[k] @ d.odometry.T_odom_lidar[d.keyframes] for k, d in enumerate(anchored)])
     factors = assembled(settings, drives, ups, fixes, found, gaps, odometers, nodes)
     factors = held(settings, factors, drives, old)
@@ -82,7 +96,8 @@ def fusion(
     for name, segments in groupby(drives, key=lambda d: d.name):
         solved = Poses.concatenate([poses_of(d, solution, covariance, origin) for d in segments])
         yield Part(final(settings, name, solved, old), name)
-    warnings = refusals(drives, fixes) + guessed(drives, gaps, found, fixes) + on_ties(drives, fixes, factors, old)
+    warnings = [*warned, *refusals(drives, fixes), *guessed(drives, gaps, found, fixes)]
+    warnings += on_ties(drives, fixes, factors, old)
     after = whitened_norms(factors, solution.T)
     residual_m = position_residuals(factors, solution.T)
     table = graph_table(factors, before, after, residual_m, _key(drives))

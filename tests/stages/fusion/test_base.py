@@ -154,14 +154,45 @@ def test_gnss_alone_holds_a_session_that_meets_no_other() -> None:
     assert np.sqrt(np.mean(error_between(poses, "a", "b") ** 2)) < 0.5
 
 
-@pytest.mark.parametrize("with_gnss", [True, False], ids=["gnss in one", "no gnss"])
 @pytest.mark.parametrize("extended", [True, False])
-def test_sessions_that_never_meet_are_an_error(with_gnss: bool, extended: bool) -> None:
-    gnss = gnss_of(FIRST_DAY) if with_gnss else None
-    base = first_map("a", gnss) if extended else NOT_YET
+def test_sessions_that_never_meet_are_an_error(extended: bool) -> None:
+    base = first_map("a") if extended else NOT_YET
     with pytest.raises(StageError, match="nothing ties this session") as error:
-        fuse("a", "b", loops_of([]), base=base, gnss=gnss)
+        fuse("a", "b", loops_of([]), base=base)
     assert error.value.where == "session b" and error.value.next_step
+
+
+def test_a_map_is_not_extended_by_nothing() -> None:
+    gnss = gnss_of(FIRST_DAY)
+    with pytest.raises(StageError, match="nothing ties this session") as error:
+        fuse("a", "b", loops_of([]), base=first_map("a", gnss), gnss=gnss)
+    assert error.value.where == "session b"
+
+
+def test_a_session_without_a_place_is_left_out_of_a_map_that_has_one() -> None:
+    poses, graph = fuse("a", "b", loops_of([]), gnss=gnss_of(FIRST_DAY))
+    assert set(poses) == {"a"} and poses["a"].frame == "world"
+    (warning,) = graph.warnings
+    assert "session b is left out" in warning and "GNSS" in warning
+    assert not any(key.startswith("b/") for key in graph.key_i)
+
+
+def test_of_sessions_without_a_place_the_largest_group_makes_the_map() -> None:
+    lost, first, second = FIRST_DAY, FIRST_DAY, SECOND_DAY
+    days = {"a": lost, "b": first, "c": second}
+    out = list(
+        fusion(
+            Settings(),
+            parts(**{name: session_of(name, world) for name, world in days.items()}),
+            parts(**{name: odometry_of(world) for name, world in days.items()}),
+            ties("b", "c", EVERYWHERE), parts(),
+            parts(**{name: imu_of(world) for name, world in days.items()}),
+        )
+    )  # fmt: skip
+    poses, graph = {part.key: part.product for part in out[:-1]}, out[-1]
+    assert set(poses) == {"b", "c"}
+    assert [w for w in graph.warnings if "session a is left out" in w]
+    assert np.sqrt(np.mean(error_between(poses, "b", "c") ** 2)) < 0.25
 
 
 def test_bases_in_different_frames_are_refused() -> None:
