@@ -4,6 +4,7 @@ SESSION ?= sample
 OUT ?=
 FLEET ?= fleet.yaml
 ARGS ?=
+BENCH ?= odometry
 PY := .venv/bin/python
 PACKAGES := schemas stages pipeline workflows
 
@@ -13,7 +14,7 @@ help:
 	@echo "make map [SESSION=log] [OUT=folder] [ARGS='--set odometry.voxel_size_m=0.4']   logs into a map"
 	@echo "make test     all tests          make check    style, types, import rules"
 	@echo "make nightly FLEET=fleet.yaml    many logs      make setup    only set up .venv"
-	@echo "make bench [ARGS='--data log']   accuracy and speed of odometry against others; their packages: make bench-setup"
+	@echo "make bench [BENCH=odometry|loops|fusion|extension] [ARGS=...]   accuracy and speed against others; their packages: make bench-setup"
 
 setup:
 	@./setup.sh run
@@ -55,7 +56,7 @@ docs: setup
 	$(PY) -m scanloom.workflows.reference docs
 
 bench: setup
-	@$(PY) -m benchmarks.odometry $(ARGS)
+	@$(PY) -m benchmarks.$(BENCH) $(ARGS)
 
 # The systems that the benchmark compares with; they are no part of the product.
 bench-setup: setup
