@@ -13,6 +13,7 @@ from scanloom.stages.fusion.gnss import Fixes
 from scanloom.stages.fusion.gravity import Gravity
 from scanloom.stages.fusion.links import Link
 from scanloom.stages.fusion.settings import Settings
+from scanloom.stages.fusion.walk import Walk, believed, stated
 from scanloom.stages.fusion.wheel import NO_MOTIONS, Odometer
 from scanloom.stages.geometry.se3 import F8, inverse, pose
 
@@ -28,7 +29,7 @@ def assembled(
     georeferenced = any(f.alignment is not None for f in fixes)
     factors = [_gauge(nodes, georeferenced)]
     for d, up, f in zip(drives, ups, fixes, strict=True):
-        factors += _motion_factors(settings, d, odometers.get(d.name))
+        factors += _motion_factors(settings, d, odometers.get(d.name), f.walk)
         factors += _gravity_factors(settings, d, up)
         factors += _gnss_factors(d, f)
     factors += [_bridge_factor(bridge) for bridge in gaps]
@@ -44,10 +45,14 @@ def _gauge(nodes: F8, georeferenced: bool) -> Factor:
     return Factor("prior", 0, -1, nodes[0], covariance)
 
 
-def _motion_factors(settings: Settings, d: Drive, odometer: Odometer | None) -> list[Factor]:
+def _motion_factors(
+    settings: Settings, d: Drive, odometer: Odometer | None, seen: Walk | None
+) -> list[Factor]:
     """Odometry between neighbouring keyframes, and the wheels beside it where there are any."""
     wheels = odometer.keyframe_motions(d) if odometer is not None else NO_MOTIONS
     walk = float(np.radians(settings.odometry_rotation_deg_sqrt_m)), settings.odometry_translation_m_sqrt_m
+    if seen is not None and settings.covariance != "fixed":
+        walk = believed(walk, seen, *stated(d), settings.gnss.walk_factor)
     motion, covariance = d.keyframe_motions(*walk, _step_covariance(settings, d, wheels.first))
     return [
         Factor("odometry", int(a), int(a) + 1, T, C)

@@ -19,6 +19,7 @@ from scanloom.stages.fusion.alignment import Alignment, align_level
 from scanloom.stages.fusion.drives import Drive
 from scanloom.stages.fusion.gnss_settings import GnssSettings
 from scanloom.stages.fusion.receiver import Flags, Texts, mark, plausible, receiver_sigma, screen
+from scanloom.stages.fusion.walk import Walk, random_walk
 from scanloom.stages.geometry.geodesy import geodetic_to_world
 from scanloom.stages.geometry.se3 import F8
 
@@ -43,6 +44,8 @@ class Fixes:
     alignment: Alignment | None
     """Of the levelled odometry; None when GNSS does not tell where the session stands."""
     remark: str
+    walk: Walk | None = None
+    """Of odometry, as these fixes show it."""
 
 
 def judge(
@@ -65,8 +68,9 @@ def judge(
     if alignment is None or remark:
         mark(verdict, np.ones(len(verdict), bool), remark)
         return Fixes(world, sigma, verdict, None, remark)
+    walk = random_walk(_plane(level[kept]), _plane(world[kept]), way[kept])
     mark(verdict, ~_spaced(way, verdict == "", settings.spacing_m), "another fix of the same stretch is used")
-    return Fixes(world, sigma, verdict, alignment, "")
+    return Fixes(world, sigma, verdict, alignment, "", walk)
 
 
 def positions(gnss: Gnss, origin: Georeference) -> F8:

@@ -64,6 +64,12 @@ class GnssSettings(BaseModel):
         le=1,
         description="smaller share of the way on which fixes agree with odometry: GNSS of the session is not used",
     )
+    walk_factor: float = Field(
+        default=4.0,
+        ge=1,
+        le=100,
+        description="by how much fixes may show odometry's random walk to be smaller or larger than set; 1: as set",
+    )
     spacing_m: float = Field(default=5.0, ge=0, le=1000, description="one fix is used per this much path, m")
     max_heading_sigma_deg: float = Field(
         default=8.0, gt=0, le=90, description="heading less certain than this: no georeference, deg"
