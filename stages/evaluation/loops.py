@@ -42,19 +42,18 @@ def judged(loops: Loops, paths: Mapping[str, TruePath]) -> Judgement:
     """Every candidate against truth, as far as truth covers both ends in one frame."""
     n = len(loops)
     known, out = np.zeros(n, bool), np.full((3, n), np.inf)
-    for a, path_a in paths.items():
-        for b, path_b in paths.items():
-            if path_a.frame != path_b.frame:
-                continue
-            rows = np.flatnonzero((loops.session_i == a) & (loops.session_j == b))
-            row_i, known_i = path_a.rows(loops.scan_i[rows])
-            row_j, known_j = path_b.rows(loops.scan_j[rows])
-            both = known_i & known_j
-            rows, row_i, row_j = rows[both], row_i[both], row_j[both]
-            T_i_j = inverse(path_a.T[row_i]) @ path_b.T[row_j]
-            known[rows] = True
-            out[0, rows] = np.linalg.norm(T_i_j[:, :3, 3], axis=1)
-            out[1:, rows] = alignment.motion_error(T_i_j, loops.T_i_j[rows])
+    for a, b in sorted(set(zip(loops.session_i, loops.session_j))):
+        if a not in paths or b not in paths or paths[a].frame != paths[b].frame:
+            continue
+        rows = np.flatnonzero((loops.session_i == a) & (loops.session_j == b))
+        row_i, known_i = paths[a].rows(loops.scan_i[rows])
+        row_j, known_j = paths[b].rows(loops.scan_j[rows])
+        both = known_i & known_j
+        rows = rows[both]
+        T_i_j = inverse(paths[a].T[row_i[both]]) @ paths[b].T[row_j[both]]
+        known[rows] = True
+        out[0, rows] = np.linalg.norm(T_i_j[:, :3, 3], axis=1)
+        out[1:, rows] = alignment.motion_error(T_i_j, loops.T_i_j[rows])
     return Judgement(known, *out)
 
 

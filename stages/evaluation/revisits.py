@@ -19,6 +19,9 @@ LEFT_BEFORE_M, LEFT_BEFORE_S = 50.0, 30.0
 FOUND_WITHIN_M = 10.0
 """A scan counts as found when a right loop ends within this much path of it."""
 
+QUERIES_AT_ONCE = 4096
+"""Bounds the memory where a vehicle passes a place many times."""
+
 Ends = tuple[F8, F8]
 """Where along the path of a session loops end (m,), m, and a value of each (m,)."""
 NO_ENDS: Ends = (np.empty(0), np.empty(0))
@@ -78,17 +81,16 @@ def _nearest_earlier(position: F8, session: I8, travelled: F8, stamp_ns: I8) -> 
     """Distance (n,) of each position to the nearest one that was left before."""
     from scipy.spatial import cKDTree
 
-    pairs = cKDTree(position).query_pairs(FARTHEST_M, output_type="ndarray")
-    a, b = pairs[:, 0], pairs[:, 1]
-    swap = stamp_ns[a] > stamp_ns[b]
-    a, b = np.where(swap, b, a), np.where(swap, a, b)
-    long_ago = (stamp_ns[b] - stamp_ns[a] >= LEFT_BEFORE_S * 1e9) & (
-        travelled[b] - travelled[a] >= LEFT_BEFORE_M
-    )
-    old = (session[a] != session[b]) | long_ago
-    a, b = a[old], b[old]
+    tree = cKDTree(position)
     nearest = np.full(len(position), np.inf)
-    np.minimum.at(nearest, b, np.linalg.norm(position[a] - position[b], axis=1))
+    for start in range(0, len(position), QUERIES_AT_ONCE):
+        queries = cKDTree(position[start : start + QUERIES_AT_ONCE])
+        near = queries.sparse_distance_matrix(tree, FARTHEST_M, output_type="ndarray")
+        j, i = near["i"] + start, near["j"]
+        later_s = (stamp_ns[j] - stamp_ns[i]) * 1e-9
+        long_ago = (later_s >= LEFT_BEFORE_S) & (travelled[j] - travelled[i] >= LEFT_BEFORE_M)
+        old = np.where(session[i] == session[j], long_ago, later_s > 0)
+        np.minimum.at(nearest, j[old], near["v"][old])
     return nearest
 
 

@@ -127,7 +127,7 @@ def _honesty(true: F8, estimate: F8, covariance: F8, how: str) -> Figure:
     """Mean of e^T C^-1 e over the poses, e the error of position in the LiDAR's frame (Bar-Shalom et al. 2001, 5.4)."""
     error = (inverse(estimate) @ true)[:, :3, 3]
     C = covariance[:, 3:, 3:]
-    usable = np.isfinite(C).all(axis=(1, 2))
+    usable = np.asarray(np.isfinite(C).all(axis=(1, 2)))
     usable[usable] = np.linalg.det(C[usable]) > 0
     error, C = error[usable], C[usable]
     squared = np.einsum("ni,ni->n", error, np.linalg.solve(C, error[..., None])[..., 0])
