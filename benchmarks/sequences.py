@@ -147,6 +147,17 @@ def make(chosen: Sequence[Drive], store: Path, *, cluster: str = "local") -> lis
     return [_sequence(drive, result) for drive in chosen]
 
 
+def produced(drive: Drive, wanted: Sequence[type[Product]], store: Path) -> Result:
+    """Run what is missing of the workflow up to the products, as a map of this drive alone."""
+    makers = _makers(wanted)
+    nodes = tuple(n for n in NODES if n.name in makers)
+    result = run(Request(nodes=nodes, sessions=(_session(drive),)), Store(store), cluster="none")
+    for task in result.failures:
+        if task.error is not None:
+            raise task.error
+    return result
+
+
 def _session(drive: Drive) -> SessionInput:
     if drive.folder is None:
         return SessionInput(drive.name, {}, {"simulate": dict(drive.simulate or {})}, frozenset({SIMULATED}))

@@ -98,7 +98,7 @@ def _row_edges(settings: ImageSettings, elevation: F4, counts: I8) -> F8:
     real = points >= STRAY_SHARE * np.median(points) if len(points) else np.zeros(0, np.bool_)
     first, last = first[real], last[real]
     if len(first) >= LEAST_BEAMS:
-        step = float(np.median(np.diff(0.5 * (first + last)))) * BIN_RAD
+        step = _step(0.5 * (first + last)) * BIN_RAD
         between = 0.5 * (last[:-1] + 1 + first[1:]) * BIN_RAD - np.pi / 2
         below = np.arange(between[0] - step, low, -step)[::-1]
         above = np.arange(between[-1] + step, high, step)
@@ -106,6 +106,12 @@ def _row_edges(settings: ImageSettings, elevation: F4, counts: I8) -> F8:
         if narrow and len(below) + len(between) + len(above) < settings.rows:
             return np.concatenate((below, between, above))
     return np.linspace(low, high + 1e-6, settings.rows + 1)[1:-1]
+
+
+def _step(middles: F8) -> float:
+    """Mean distance of beams next to each other; wide gaps, where beams saw nothing, are left out."""
+    steps = np.diff(middles)
+    return float(np.mean(steps[steps < 1.5 * np.median(steps)]))
 
 
 def _row_middles(row: I4, elevation: F4, edges: F8) -> F8:

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Collection, Iterator, Sequence
-from typing import Any
-
-import numpy as np
 
 from scanloom.schemas.errors import StageError
 from scanloom.schemas.loops import Places
-from scanloom.schemas.product import Parts, columns_of
+from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, ScanLabels
 
 
@@ -30,12 +26,7 @@ def keyframe_scans(
 
 def joined(chunks: Sequence[Places]) -> Places:
     """The places of all chunks of a session as one table, in sequence."""
-    if len(chunks) == 1:
-        return chunks[0]
-    columns: dict[str, Any] = {
-        name: np.concatenate([getattr(c, name) for c in chunks]) for name in columns_of(Places)
-    }
-    return dataclasses.replace(chunks[0], **columns)
+    return Places.concatenate(chunks)
 
 
 class ScanShelf:
