@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8
 
 I8 = NDArray[np.int64]
@@ -30,6 +31,8 @@ SIGMAS = 3.5
 """Chance lies beyond once in 450 times, in the plane."""
 MOST_COMPARED = 2000
 """Fixes a fix is compared with; bounds the time for a vehicle that stands for hours."""
+MOST_CHORDS = 50
+"""That say how odometry is turned at a place; of more, some are asked."""
 ROUNDS = 3
 
 
@@ -56,7 +59,9 @@ def agreeing(
         residual = q - straight
         seen = _scatter(residual[keep]) if keep.sum() > 10 else np.inf
         sigma = np.clip(seen, sigma_m / BETTER, sigma_m)
-        keep = longest_chain(residual, way_m, sigma, tolerance_m, drift, farthest_m)
+        before, keep = keep, longest_chain(residual, way_m, sigma, tolerance_m, drift, farthest_m)
+        if np.array_equal(before, keep):
+            break
     return keep
 
 
@@ -93,27 +98,41 @@ def longest_chain(
     It may change by a fixed tolerance, by 3.5 sigma and by the drift over the way between them. Fixes further apart than
     `farthest_m` are not compared: there the chain goes on anew. Dynamic programming.
     """
-    n = len(residual)
-    length, previous = np.ones(n, np.int64), np.full(n, -1, np.int64)
     far = np.searchsorted(way_m, way_m - farthest_m)
-    longest_to = np.zeros(n, np.int64)
-    """Which of the fixes up to here ends the longest chain."""
+    first = np.maximum(far, np.arange(len(residual)) - MOST_COMPARED)
+    x, y = np.ascontiguousarray(residual.real), np.ascontiguousarray(residual.imag)
+    way, sigma = np.ascontiguousarray(way_m, np.float64), np.ascontiguousarray(sigma_m, np.float64)
+    return _chain(
+        x, y, way, sigma, far.astype(np.int64), first.astype(np.int64), float(tolerance_m), float(drift)
+    )
+
+
+@kernel
+def _chain(
+    x: F8, y: F8, way_m: F8, sigma_m: F8, far: I8, first: I8, tolerance_m: float, drift: float
+) -> Flags:
+    """Fixes before `far` are not compared, those from `first` on are."""
+    n = len(x)
+    length, previous = np.ones(n, np.int64), np.full(n, -1, np.int64)
+    ends = np.zeros(n, np.int64)
     for k in range(1, n):
-        a = np.arange(max(far[k], k - MOST_COMPARED), k)
-        allowed = tolerance_m + SIGMAS * np.hypot(sigma_m[a], sigma_m[k]) + drift * (way_m[k] - way_m[a])
-        counted = np.where(np.abs(residual[k] - residual[a]) <= allowed, length[a], 0)
-        if len(a) and counted.max() > 0:
-            at = len(a) - 1 - int(np.argmax(counted[::-1]))
-            length[k], previous[k] = counted[at] + 1, a[at]
-        if far[k] > 0 and length[longest_to[far[k] - 1]] >= length[k]:
-            previous[k] = longest_to[far[k] - 1]
+        best = 0
+        for a in range(k - 1, first[k] - 1, -1):
+            if length[a] > best:
+                sigma = np.sqrt(sigma_m[a] ** 2 + sigma_m[k] ** 2)
+                allowed = tolerance_m + SIGMAS * sigma + drift * (way_m[k] - way_m[a])
+                if np.sqrt((x[k] - x[a]) ** 2 + (y[k] - y[a]) ** 2) <= allowed:
+                    best = length[a]
+                    length[k], previous[k] = best + 1, a
+        if far[k] > 0 and length[ends[far[k] - 1]] >= length[k]:
+            previous[k] = ends[far[k] - 1]
             length[k] = length[previous[k]] + 1
-        longest_to[k] = k if length[k] > length[longest_to[k - 1]] else longest_to[k - 1]
-    keep = np.zeros(n, bool)
-    k = int(longest_to[-1]) if n else -1
+        ends[k] = k if length[k] > length[ends[k - 1]] else ends[k - 1]
+    keep = np.zeros(n, np.bool_)
+    k = ends[n - 1] if n else -1
     while k >= 0:
         keep[k] = True
-        k = int(previous[k])
+        k = previous[k]
     return keep
 
 
@@ -135,10 +154,13 @@ def _chord_turns(
 
 def _middle_turn(turn: C16) -> complex:
     """Geometric median of unit numbers, back on the circle (Weiszfeld)."""
+    turn = turn[:: max(1, len(turn) // MOST_CHORDS)]
     centre = turn.mean()
     for _ in range(20):
         w = 1.0 / np.maximum(np.abs(turn - centre), 1e-3)
-        centre = (w * turn).sum() / w.sum()
+        last, centre = centre, (w * turn).sum() / w.sum()
+        if abs(centre - last) < 1e-4:
+            break
     return complex(centre / abs(centre)) if abs(centre) > 0 else complex(1.0)
 
 

@@ -13,7 +13,7 @@ CHORD_M = 15.0
 LAG_STEP_S = 0.1
 LAG_CAP_M = 2.0
 """Distances that disagree by more count as this much: a lie must not outvote the rest."""
-MOST_CHORDS = 4000
+MOST_CHORDS = 2000
 LEAST_CHORDS = 20
 STRETCHES = 20
 CLEAR_GAIN = 3.0
