@@ -19,11 +19,12 @@ from scanloom.pipeline.plan import plan as plan_tasks
 from scanloom.pipeline.progress import Progress
 from scanloom.pipeline.run import Result, run
 from scanloom.pipeline.store import Store
-from scanloom.schemas.errors import EXIT_INTERNAL, EXIT_OK, EXIT_SOME_FAILED, ScanloomError
+from scanloom.schemas.errors import EXIT_INTERNAL, EXIT_OK, EXIT_SOME_FAILED, ScanloomError, StageError
 from scanloom.schemas.evaluation import Metrics, ReportFiles
 from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.session import Session
 from scanloom.schemas.tiles import TileIndex
+from scanloom.schemas.trajectory import Odometry, Poses
 from scanloom.stages.report.page import compose, run_section
 from scanloom.workflows.configuration import Overrides, merged
 from scanloom.workflows.delivery import Label, Metric, change_rows, claim, deliver, metric_rows, write_text
@@ -93,7 +94,7 @@ def build_map(order: Order, progress: Progress | None = None) -> Outcome:
     claim(order.out)
     request = _request(order, sessions)
     result = run(request, store, cluster=order.cluster, workers=order.workers, progress=progress)
-    failures = errors + [(_place(task), task.error) for task in result.failures if task.error is not None]
+    failures = errors + _failures(result)
     delivered = bool(result.files(ReportFiles)) and bool(result.files(TileIndex))
     metrics: list[Metric] = []
     if delivered:
@@ -243,7 +244,36 @@ def _warnings(result: Result) -> list[str]:
         for problem in session.problems
         if problem.severity != "info"
     ]
-    return of_logs + [text for graph in result.parts(Graph) for text in graph.warnings]
+    left_out = [error.what for error in _left_out(result).values()]
+    of_fusion = [text for graph in result.parts(Graph) for text in graph.warnings]
+    return of_logs + [text for text in of_fusion if not any(text.startswith(what) for what in left_out)]
+
+
+def _failures(result: Result) -> list[tuple[str, ScanloomError]]:
+    """What went wrong, task by task; of a session that fusion left out only that."""
+    left_out = _left_out(result)
+    rows = [
+        (_place(task), task.error)
+        for task in result.failures
+        if task.error is not None and task.coordinate.get("session") not in left_out
+    ]
+    return rows + [(f"session {name}", error) for name, error in left_out.items()]
+
+
+def _left_out(result: Result) -> dict[str, ScanloomError]:
+    """Sessions that came as far as fusion and are not in the map: it says why in its warnings."""
+    graphs = result.parts(Graph)
+    if not len(graphs):
+        return {}
+    came = {dict(where)["session"] for where, _ in result.files(Odometry)}
+    fused = {dict(where)["session"] for where, _ in result.files(Poses)}
+    found: dict[str, ScanloomError] = {}
+    for text in graphs[0].warnings:
+        name = next((n for n in came - fused if text.startswith(f"session {n} is left out")), None)
+        if name is not None:
+            what, _, next_step = text.partition("; ")
+            found[name] = StageError(what, next_step=next_step)
+    return found
 
 
 def _place(task: Any) -> str:

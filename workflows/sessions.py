@@ -14,20 +14,12 @@ from scanloom.schemas.errors import ScanloomError, UsageError
 from scanloom.schemas.product import Files, Product
 from scanloom.schemas.session import RawLog, TruthLog
 from scanloom.stages.logs.locate import locate
+from scanloom.stages.simulate.settings import SECOND_DAY
 from scanloom.workflows.map_session import SIMULATED
 
 SAMPLE = "sample"
 SECOND_SAMPLE = "sample2"
-SIMULATED_SESSIONS: Mapping[str, Mapping[str, Any]] = {
-    SAMPLE: {},
-    SECOND_SAMPLE: {
-        "seed": 1,
-        "parking_seed": 1,
-        "start_s": 1_760_086_400,
-        "start_m": 60.0,
-        "duration_s": 120.0,
-    },
-}
+SIMULATED_SESSIONS: Mapping[str, Mapping[str, Any]] = {SAMPLE: {}, SECOND_SAMPLE: SECOND_DAY}
 """What the simulator is told for each of the words: `sample2` is another drive through the same town a day later."""
 
 

@@ -51,7 +51,9 @@ def test_everything_is_delivered(mapped: Path) -> None:
     assert 0.05 < np.abs(np.diff(tum[:, 0])).max() < 0.15
     described = json.loads((out / "map.json").read_text())
     on_disk = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
-    assert set(described["files"]) == on_disk - {".scanloom", "map.json", "metrics.json", "report.html"}
+    assert set(described["files"]) == on_disk - {
+        ".scanloom", "map.json", "sources.json", "metrics.json", "report.html",
+    }  # fmt: skip
     assert described["points"] == pq.read_table(out / "tiles/index.parquet")["points"].to_numpy().sum()
 
 
@@ -87,7 +89,7 @@ def test_tile_size_reruns_tiling_and_what_follows(mapped: Path) -> None:
     verdicts = {task["node"]: task["verdict"] for task in plan}
     assert verdicts.pop("tiling") == "RUN"
     assert "tile_size_m" in next(task["reason"] for task in plan if task["node"] == "tiling")
-    after = {"tiles", "overview", "picture", "evaluation", "report"}
+    after = {"changes", "tiles", "overview", "picture", "evaluation", "report"}
     assert {node for node, verdict in verdicts.items() if verdict != "HIT"} == after
 
 
