@@ -126,7 +126,7 @@ def test_what_left_is_reported_and_stays_in_the_map(world: Path, second: Outcome
     low, high = np.array(CAR)
     assert list(changes.sessions) == ["tuesday"]
     assert set(changes.object_) == {0} and len(points) > 50
-    assert ((points > low - 0.3) & (points < high + 0.3)).all()
+    assert ((points > low - 0.5) & (points < high + 0.5)).all()
     values = {row["name"]: row["value"] for row in second.metrics}
     assert values["changes.objects"] == 1 and values["changes.points"] == len(points)
     index = TileIndex.open(second.out / "tiles/index.parquet")
