@@ -35,6 +35,8 @@ class Changed:
     scale: str
     objects: int
     points: int
+    remnants: int
+    """Points besides that only moving things had left in the map."""
     listed: list[Gone]
 
 
@@ -47,7 +49,9 @@ def changed(paths: Mapping[str, Poses], changes: Changes | None) -> Changed | No
     objects = [_gone(changes, part) for part in rows if len(part)]
     objects.sort(key=lambda gone: -gone.points)
     svg, scale = _drawn(paths, objects)
-    return Changed(changes.sessions, svg, scale, len(numbers), len(changes), objects[:_MOST_LISTED])
+    return Changed(
+        changes.sessions, svg, scale, len(numbers), len(changes), changes.remnants, objects[:_MOST_LISTED]
+    )
 
 
 def _gone(changes: Changes, rows: NDArray[np.int64]) -> Gone:

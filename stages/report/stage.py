@@ -1,4 +1,9 @@
-"""Report: the parts of `report.html` that do not vary from run to run."""
+"""Report: the parts of `report.html` that do not vary from run to run.
+
+A verdict with every check behind it; the map from above; errors along the way; the loop graph with what was refused and
+why; GNSS residuals by verdict; where odometry was blind, and in which direction; the pose graph kind by kind; for an
+extended map what is no longer there; all figures; the input and what is odd about it; the tiles.
+"""
 
 from __future__ import annotations
 

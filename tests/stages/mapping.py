@@ -15,7 +15,7 @@ from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, S
 from scanloom.schemas.session import Session
 from scanloom.schemas.tiles import Piece, Tile, TileFiles
 from scanloom.schemas.trajectory import Odometry, Poses, Truth
-from scanloom.stages.geometry.se3 import F8, inverse
+from scanloom.stages.geometry.se3 import F8, inverse, pose, so3_exp
 from scanloom.stages.tiling import tiles, tiling
 from scanloom.stages.tiling.pieces import Settings as TilingSettings
 from scanloom.stages.tiling.tiles import Settings as TilesSettings
@@ -29,11 +29,34 @@ def stamps(count: int) -> np.ndarray:
     return START_NS + PERIOD_NS * np.arange(count)
 
 
+def circle(count: int = 1000, step_m: float = 1.0, radius_m: float = 80.0) -> F8:
+    """A drive of `count` scans around a circle, two times for the defaults."""
+    turn = pose(so3_exp([0, 0, step_m / radius_m]), [step_m, 0, 0])
+    T = [np.eye(4)]
+    for _ in range(count - 1):
+        T.append(T[-1] @ turn)
+    return np.array(T)
+
+
+def drifting(
+    T: F8, scale: float = 1.0, yaw_rate_rad_m: float = 0.0, seed: int = 0, noise_m: float = 0.0
+) -> F8:
+    """The same motion with a scale error, a constant yaw drift and white noise of each step."""
+    rng = np.random.default_rng(seed)
+    out = [T[0]]
+    for step in inverse(T[:-1]) @ T[1:]:
+        wrong = step.copy()
+        wrong[:3, 3] = scale * step[:3, 3] + rng.normal(0, noise_m, 3)
+        yaw = yaw_rate_rad_m * np.linalg.norm(step[:3, 3])
+        out.append(out[-1] @ wrong @ pose(so3_exp([0, 0, yaw]), np.zeros(3)))
+    return np.array(out)
+
+
 def labels_of(scans: Sequence[DeskewedScan], T: F8) -> list[ScanLabels]:
     """Ground by height of the true point, everything else static."""
     labels = []
-    for scan, pose in zip(scans, T):
-        z = scan.points() @ pose[2, :3] + pose[2, 3]
+    for scan, T_map_lidar in zip(scans, T):
+        z = scan.points() @ T_map_lidar[2, :3] + T_map_lidar[2, 3]
         classes = np.where(z < GROUND_Z_M + 0.15, PointClass.GROUND, PointClass.STATIC).astype(np.uint8)
         labels.append(ScanLabels(class_=classes, reference_ns=scan.reference_ns, scan_index=scan.scan_index))
     return labels

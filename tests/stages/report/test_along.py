@@ -233,7 +233,7 @@ def changes_of(objects: list[tuple[float, float, int]], sessions: tuple[str, ...
     n = len(number)
     return Changes(
         x_m=xyz[:, 0].copy(), y_m=xyz[:, 1].copy(), z_m=xyz[:, 2].copy(), through=np.full(n, 7, np.int32),
-        confirming=np.zeros(n, np.int32), object_=number, sessions=sessions, frame="map", georeference=None,
+        confirming=np.zeros(n, np.int32), object_=number, remnants=31, sessions=sessions, frame="map", georeference=None,
     )  # fmt: skip
 
 

@@ -342,5 +342,6 @@ def test_what_an_extension_no_longer_found_has_a_section_of_its_own(street_map: 
     assert "2 objects of the map that was extended are no longer there" in text
     assert "480 points that b saw through" in text
     assert "1.0 × 1.0 × 1.0" in text
+    assert "31 points that only moving things had left" in text
     assert "is still there" in parse(body(street_map.report(changes=changes_of([])))).text
     assert "What has changed" not in body(street_map.report())

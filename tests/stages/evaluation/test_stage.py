@@ -15,40 +15,18 @@ from scanloom.schemas.tracks import Gnss
 from scanloom.schemas.trajectory import Odometry, Truth
 from scanloom.stages.evaluation import evaluation
 from scanloom.stages.evaluation.stage import Settings
-from scanloom.stages.geometry.alignment import (
-    absolute_errors,
-    errors_from_start,
-    kitti_errors,
-    relative_errors,
-    travelled,
-    umeyama,
+from scanloom.stages.geometry.se3 import F8, se3_exp
+from tests.stages.mapping import (
+    circle,
+    drifting,
+    graph_of,
+    loops_of,
+    odometry_of,
+    one,
+    poses_of,
+    session_of,
+    truth_of,
 )
-from scanloom.stages.geometry.entropy import mean_entropy, point_entropies
-from scanloom.stages.geometry.se3 import F8, inverse, pose, se3_exp, so3_exp, transform
-from tests.stages.mapping import graph_of, loops_of, odometry_of, one, poses_of, session_of, truth_of
-
-
-def circle(count: int = 1000, step_m: float = 1.0, radius_m: float = 80.0) -> F8:
-    """A drive of `count` scans around a circle, two times for the defaults."""
-    turn = pose(so3_exp([0, 0, step_m / radius_m]), [step_m, 0, 0])
-    T = [np.eye(4)]
-    for _ in range(count - 1):
-        T.append(T[-1] @ turn)
-    return np.array(T)
-
-
-def drifting(
-    T: F8, scale: float = 1.0, yaw_rate_rad_m: float = 0.0, seed: int = 0, noise_m: float = 0.0
-) -> F8:
-    """The same motion with a scale error, a constant yaw drift and white noise of each step."""
-    rng = np.random.default_rng(seed)
-    out = [T[0]]
-    for step in inverse(T[:-1]) @ T[1:]:
-        wrong = step.copy()
-        wrong[:3, 3] = scale * step[:3, 3] + rng.normal(0, noise_m, 3)
-        yaw = yaw_rate_rad_m * np.linalg.norm(step[:3, 3])
-        out.append(out[-1] @ wrong @ pose(so3_exp([0, 0, yaw]), np.zeros(3)))
-    return np.array(out)
 
 
 def random_tile(points: F8, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Tile:
@@ -77,145 +55,6 @@ def run(
     metrics = made[-1]
     assert isinstance(metrics, Metrics)
     return dict(zip(metrics.name, metrics.value)), made[:-1], metrics  # type: ignore[return-value]
-
-
-# --- alignment ---
-
-
-def test_umeyama_finds_the_motion_even_of_flat_and_mirrored_clouds() -> None:
-    rng = np.random.default_rng(0)
-    T = pose(so3_exp([0.4, -2.0, 1.0]), [5, -3, 2])
-    for scale in ([1, 1, 1], [1, 1, 0]):
-        points = rng.normal(size=(50, 3)) * scale
-        assert np.abs(umeyama(transform(T, points), points) - T).max() < 1e-12
-    found = umeyama(rng.normal(size=(3, 3)) * [-1, 1, 1], rng.normal(size=(3, 3)))
-    assert np.linalg.det(found[:3, :3]) == pytest.approx(1.0)
-
-
-def test_umeyama_of_noisy_points_is_as_good_as_the_noise_allows() -> None:
-    rng = np.random.default_rng(1)
-    points = rng.normal(0, 10, (2000, 3))
-    T = pose(so3_exp([0.1, 0.2, -0.3]), [1, 2, 3])
-    found = umeyama(transform(T, points) + rng.normal(0, 0.1, points.shape), points)
-    error = np.linalg.norm((inverse(T) @ found)[:3, 3])
-    assert 0.0002 < error < 0.02
-
-
-def test_a_moved_trajectory_has_no_error_and_a_longer_one_has() -> None:
-    T = circle()
-    moved = pose(so3_exp([0.3, 0.1, 2.0]), [100, -50, 3]) @ T
-    assert absolute_errors(T, moved).max() < 1e-9
-    assert errors_from_start(T, moved).max() < 1e-9
-    grown = T.copy()
-    grown[:, :3, 3] *= 1.01
-    assert np.allclose(absolute_errors(T, grown), 0.8, atol=0.1)  # one per cent of the radius
-
-
-def test_kitti_drift_is_the_scale_error_of_a_straight_road() -> None:
-    T = circle(1500, radius_m=1e9)
-    drift = kitti_errors(T, drifting(T, scale=1.013))
-    assert drift is not None
-    assert drift.t_rel_percent == pytest.approx(1.3, abs=0.02)
-    assert drift.r_rel_deg_per_100m < 1e-4
-
-
-def test_kitti_rotation_drift_is_the_yaw_rate() -> None:
-    T = circle(900)
-    drift = kitti_errors(T, drifting(T, yaw_rate_rad_m=np.radians(0.5) / 100))
-    assert drift is not None
-    assert drift.r_rel_deg_per_100m == pytest.approx(0.5, rel=0.02)
-
-
-def test_kitti_segments_are_those_of_the_benchmark() -> None:
-    """By a plain loop, as `evaluate_odometry.cpp` has it."""
-    T, estimate = circle(450, step_m=0.9), drifting(circle(450, step_m=0.9), 1.01, noise_m=0.02)
-    path = travelled(T)
-    errors = []
-    for first in range(0, len(T), 10):
-        for length in range(100, 801, 100):
-            last = next((i for i in range(first, len(T)) if path[i] > path[first] + length), None)
-            if last is not None:
-                motion = inverse(estimate[first]) @ estimate[last]
-                error = inverse(motion) @ (inverse(T[first]) @ T[last])
-                errors.append(np.linalg.norm(error[:3, 3]) / length)
-    drift = kitti_errors(T, estimate)
-    assert drift is not None
-    assert drift.segments == len(errors)
-    assert drift.t_rel_percent == pytest.approx(100 * np.mean(errors), rel=1e-12)
-
-
-def test_short_paths_have_no_kitti_drift() -> None:
-    assert kitti_errors(circle(90), circle(90)) is None
-    assert len(relative_errors(circle(90), circle(90), 10.5)) == 79
-
-
-def test_relative_error_grows_as_white_noise_does() -> None:
-    T = circle(4000)
-    estimate = drifting(T, noise_m=0.02)
-    short, long = (relative_errors(T, estimate, length).translation_m for length in (5.0, 20.0))
-    rms = np.sqrt(np.mean(short**2))
-    assert 0.8 < rms / (0.02 * np.sqrt(3 * 6)) < 1.2  # six steps: the first pose beyond 5 m
-    assert 1.5 < np.sqrt(np.mean(long**2)) / rms < 2.3
-
-
-# --- entropy ---
-
-
-@pytest.mark.parametrize("sigma_m", [0.01, 0.02, 0.04])
-def test_entropy_of_a_noisy_plane_is_known_in_closed_form(sigma_m: float) -> None:
-    rng = np.random.default_rng(0)
-    points = np.column_stack((rng.uniform(0, 8, (60_000, 2)), rng.normal(0, sigma_m, 60_000)))
-    inner = np.flatnonzero(((points[:, :2] > 1) & (points[:, :2] < 7)).all(axis=1))[:1500]
-    radii = (0.3, 0.5, 1.0)
-    mean, share = mean_entropy(point_entropies(points.astype(np.float32), inner, radii, 6))
-    want = [0.5 * np.log((2 * np.pi * np.e) ** 3 * r**4 * sigma_m**2 / 16) for r in radii]
-    assert share.tolist() == [1.0, 1.0, 1.0]
-    assert (
-        np.abs(mean - want) < 0.03 + 3 * (sigma_m / np.array(radii)) ** 2
-    ).all()  # exact for a thin plane only
-    assert np.abs(mean - want).max() > 0.0005
-
-
-def test_entropy_equals_the_textbook_formula_point_by_point() -> None:
-    rng = np.random.default_rng(3)
-    points = rng.normal(0, 1.5, (800, 3)).astype(np.float32)
-    queries = np.arange(0, 800, 40)
-    got = point_entropies(points, queries, (0.5, 1.5), 6)
-    for row, q in enumerate(queries):
-        for k, radius in enumerate((0.5, 1.5)):
-            near = points[np.linalg.norm(points.astype(float) - points[q], axis=1) <= radius].astype(float)
-            if len(near) < 6:
-                assert np.isnan(got[row, k])
-            else:
-                sign, logdet = np.linalg.slogdet(2 * np.pi * np.e * np.cov(near.T))
-                assert sign > 0
-                assert got[row, k] == pytest.approx(0.5 * logdet, abs=1e-6)
-
-
-def test_entropy_skips_lonely_points_and_perfect_planes() -> None:
-    flat = np.column_stack((np.random.default_rng(0).uniform(0, 1, (50, 2)), np.zeros(50))).astype(np.float32)
-    assert np.isnan(point_entropies(flat, np.arange(50), (0.5,), 6)).all()
-    mean, share = mean_entropy(point_entropies(flat[:3], np.arange(3), (0.5,), 6))
-    assert np.isnan(mean[0])
-    assert share[0] == 0.0
-    with pytest.raises(ValueError, match="increase"):
-        point_entropies(flat, np.arange(3), (1.0, 0.5), 6)
-
-
-def test_a_blurred_map_has_more_entropy() -> None:
-    rng = np.random.default_rng(0)
-    sharp = np.column_stack((rng.uniform(0, 20, (100_000, 2)), rng.normal(0, 0.02, 100_000)))
-    double = sharp + np.array([0, 0, 0.1]) * (rng.random(len(sharp)) < 0.5)[:, None]
-    T = circle(20)
-    values = [run(T, T, tiles=one_tile(points))[0]["map.mme_r0.5_nat"] for points in (sharp, double)]
-    assert 0.4 < values[1] - values[0] < 1.2  # ln of the ratio of the spreads: 0.05 to 0.02 is 0.98
-
-
-def one_tile(points: F8) -> Parts[Tile]:
-    return Parts([((("tile", "0_0"),), random_tile(points))])
-
-
-# --- the stage ---
 
 
 def test_drift_in_gives_the_same_drift_out() -> None:
@@ -351,3 +190,16 @@ def test_rotation_errors_show_in_degrees() -> None:
     estimate = T @ se3_exp(np.random.default_rng(0).normal(0, [0.01] * 3 + [0.0] * 3, (200, 6)))
     figures, _, _ = run(T, estimate)
     assert 1.0 < figures["odometry.rpe5_deg"] < 1.8  # 0.01 rad, three axes, two ends: 1.4 deg
+
+
+def test_a_blurred_map_has_more_entropy() -> None:
+    rng = np.random.default_rng(0)
+    sharp = np.column_stack((rng.uniform(0, 20, (100_000, 2)), rng.normal(0, 0.02, 100_000)))
+    double = sharp + np.array([0, 0, 0.1]) * (rng.random(len(sharp)) < 0.5)[:, None]
+    T = circle(20)
+    values = [run(T, T, tiles=one_tile(points))[0]["map.mme_r0.5_nat"] for points in (sharp, double)]
+    assert 0.4 < values[1] - values[0] < 1.2  # ln of the ratio of the spreads: 0.05 to 0.02 is 0.98
+
+
+def one_tile(points: F8) -> Parts[Tile]:
+    return Parts([((("tile", "0_0"),), random_tile(points))])
