@@ -111,7 +111,9 @@ def score(grid: U8, cells: NDArray[np.int32], bits: U8, x: Int, y: Int, z: Int) 
 
 
 @kernel
-def children(grid: U8, cells: NDArray[np.int32], bits: U8, x: Int, y: Int, z: Int, step: Int) -> NDArray[np.int64]:
+def children(
+    grid: U8, cells: NDArray[np.int32], bits: U8, x: Int, y: Int, z: Int, step: Int
+) -> NDArray[np.int64]:
     """Scores (8,) at all corners of a cube of edge `step` from (x, y, z) on, z fastest."""
     totals = np.zeros(8, np.int64)
     low, high = np.uint64(max(z, 0)), np.uint64(max(z + step, 0))

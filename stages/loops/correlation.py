@@ -70,6 +70,7 @@ class Peak:
     T_i_j: F8
     score: float
 
+
 def peaks(
     grid: U8, low_m: float, points: F8, prior: Prior, most: int, least_share: float, least_score: float
 ) -> list[Peak]:
@@ -89,7 +90,7 @@ def peaks(
     out = []
     for (a, x, y, z), value in zip(found, scores, strict=True):
         shift = np.array([x - reach, y - reach, z - reach_z]) * CELL_M
-        T = pose(so3_exp([0.0, 0.0, yaws[a]]), shift + [prior.x_m, prior.y_m, prior.z_m])
+        T = pose(so3_exp([0.0, 0.0, yaws[a]]), shift + np.array([prior.x_m, prior.y_m, prior.z_m]))
         out.append(Peak(T, float(value) / full))
     return out
 
@@ -121,7 +122,9 @@ def _search(
         place = _place(INDEX_MASK - (key & INDEX_MASK), window)
         if (key >> BOX_BIT) & 1:
             level = (key >> LEVEL_BIT) & 7
-            queue, waiting = _split(grid, cells, bits, reach, reach_z, window, place, level, least, queue, waiting)
+            queue, waiting = _split(
+                grid, cells, bits, reach, reach_z, window, place, level, least, queue, waiting
+            )
             continue
         if peaks == 0:
             least = max(least, np.int64(np.ceil(least_share * bound)))

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.stages.geometry.kernels import kernel
+from scanloom.stages.geometry.registration import Registration
 from scanloom.stages.geometry.se3 import F8, inverse, transform
 from scanloom.stages.geometry.voxel_map import F4, I4, I8, STEPS, VoxelMap, nearest
 from scanloom.stages.geometry.voxels import Float, voxel_keys
@@ -16,6 +17,8 @@ TALLER_THAN_A_CAR_M = 2.2
 """Cars, people and cyclists stay below: what stands higher is there on another day as well."""
 UPRIGHT_M = 0.5
 DISPLACED_M = 1.5
+LEVEL_NORMAL = 0.8
+LEAST_LEVEL = 30
 SEEN_M = 3.0
 """Edge of a column in which one point tells that a submap saw what is there."""
 
@@ -65,6 +68,18 @@ def displaced(target: VoxelMap, points: F8, distance_m: float) -> tuple[float, f
         step = DISPLACED_M * np.array([np.cos(angle), np.sin(angle), 0.0])
         there = max(there, float(inliers(target, points + step, distance_m).mean()))
     return here, there
+
+
+def unevenness_m(r: Registration) -> float:
+    """Root mean square residual of ground, and of what else is level, m; of everything where there is little of that.
+
+    Towns repeat houses; the relief of the land under them is a fingerprint.
+    """
+    level = np.abs(r.normals[:, 2]) > LEVEL_NORMAL
+    if level.sum() < LEAST_LEVEL:
+        level = np.ones(len(r.normals), np.bool_)
+    total = float(r.weights[level].sum())
+    return float(np.sqrt((r.weights[level] * r.residuals[level] ** 2).sum() / total)) if total > 0 else np.inf
 
 
 @kernel

@@ -117,9 +117,7 @@ def proposals(settings: MatchingSettings, i: Submap, j: Submap, prior: Prior) ->
     grid = pyramid(np.vstack((upright(i), i.points[i.ground])), low)
     ground = j.points[j.ground]
     moving = np.vstack((upright(j), ground[downsample(ground, GROUND_SPACING_M)]))
-    return peaks(
-        grid, low, moving, prior, settings.peaks, settings.least_share, settings.least_score
-    )
+    return peaks(grid, low, moving, prior, settings.peaks, settings.least_share, settings.least_score)
 
 
 def refined(settings: MatchingSettings, target: Target, j: Submap, found: Sequence[Peak]) -> list[Match]:
@@ -146,6 +144,12 @@ def refined(settings: MatchingSettings, target: Target, j: Submap, found: Sequen
 def fine(target: VoxelMap, source: Submap, T: F8) -> Registration:
     """The last registration."""
     return align(target, _thin(source, 0.8), T, max_distance_m=0.8, scale_m=0.15, max_iterations=20)
+
+
+def itself(own: VoxelMap, submap: Submap) -> Registration:
+    """A submap against its own map: residuals as its sensor, its odometry, and the roughness of the place leave them."""
+    thin = _thin(submap, 0.8)
+    return align(own, thin, np.eye(4), max_distance_m=0.8, scale_m=0.15, max_iterations=1)
 
 
 def same(a: F8, b: F8) -> bool:

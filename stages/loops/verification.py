@@ -2,7 +2,7 @@
 
 Matching gives the pose and its rivals. Four indicators judge it: inlier ratio, residual, free-space conflict (E3) and E1.
 A loop needs all four; where only two or three agree it is called doubtful, and refused like others, but says so. Beyond
-these it must overlap, be distinct, see every direction, agree with its own inverse and with odometry.
+these it must overlap, be distinct, see every direction, show the same relief, agree with its own inverse and odometry.
 """
 
 from __future__ import annotations
@@ -17,8 +17,17 @@ from scanloom.stages.geometry.registration import Registration, VoxelMap
 from scanloom.stages.geometry.se3 import F8, inverse, se3_log, transform
 from scanloom.stages.geometry.voxels import downsample
 from scanloom.stages.loops.candidates import Candidate
-from scanloom.stages.loops.indicators import comparable, displaced, inliers, overlap
-from scanloom.stages.loops.matching import Match, MatchingSettings, Target, fine, prior_of, proposals, refined
+from scanloom.stages.loops.indicators import comparable, displaced, inliers, overlap, unevenness_m
+from scanloom.stages.loops.matching import (
+    Match,
+    MatchingSettings,
+    Target,
+    fine,
+    itself,
+    prior_of,
+    proposals,
+    refined,
+)
 from scanloom.stages.loops.submaps import Submap
 
 LEAST_AGREEING = 2
@@ -34,7 +43,10 @@ class VerificationSettings(MatchingSettings):
         default=20.0, gt=0, le=100, description="loops between poses farther apart are rejected, m"
     )
     min_inlier_ratio: float = Field(
-        default=0.55, ge=0, le=1, description="share of submap j with a partner, of what i saw as well, at least"
+        default=0.45,
+        ge=0,
+        le=1,
+        description="share of submap j with a partner, of what i saw as well, at least",
     )
     min_structure_ratio: float = Field(
         default=0.35, ge=0, le=1, description="the same of points that are not ground"
@@ -46,7 +58,7 @@ class VerificationSettings(MatchingSettings):
         default=0.05, gt=0, le=5, description="worst standard deviation of translation, m"
     )
     max_seen_through: float = Field(
-        default=0.035,
+        default=0.07,
         ge=0,
         le=1,
         description="share of tall structure of one pass that the other looked through",
@@ -63,6 +75,12 @@ class VerificationSettings(MatchingSettings):
     )
     max_rival: float = Field(
         default=0.85, ge=0, le=1, description="fit of the second-best pose over that of the best, at most"
+    )
+    max_unevenness: float = Field(
+        default=2.3,
+        ge=1,
+        le=100,
+        description="residual of the ground over that which each submap has with itself, at most: the same relief",
     )
     max_disagreement_m: float = Field(
         default=0.25, gt=0, le=5, description="forward against backward registration, m"
@@ -177,7 +195,11 @@ def _refusal(
     reason = _unfit(settings, e) or _implausible(settings, c, path_m, e.T_i_j)
     if len(doubts) > 4 - LEAST_AGREEING:
         return doubts[0]
-    reason = reason or _indistinct(settings, target, j, e.match.T) or _one_sided(settings, target, j, e.match.T)
+    reason = reason or _indistinct(settings, target, j, e.match.T)
+    if not reason:
+        own = VoxelMap(1.0, 20)
+        own.insert(j.points)
+        reason = _one_sided(settings, own, target, e.match.T) or _other_ground(settings, e, own, target, j)
     if reason or not doubts:
         return reason
     return f"doubtful, {4 - len(doubts)} of 4 indicators agree: {doubts[0]}"
@@ -249,15 +271,26 @@ def _indistinct(settings: VerificationSettings, target: Target, j: Submap, T: F8
     return ""
 
 
-def _one_sided(settings: VerificationSettings, target: Target, j: Submap, T: F8) -> str:
-    """Registration of i to j must give the inverse."""
-    other = VoxelMap(1.0, 20)
-    other.insert(j.points)
-    back = fine(other, target.submap, inverse(T))
+def _one_sided(settings: VerificationSettings, own: VoxelMap, target: Target, T: F8) -> str:
+    """Registration of i to j, whose own map this is, must give the inverse."""
+    back = fine(own, target.submap, inverse(T))
     difference = se3_log(T @ back.T_target_source)
     turn, shift = float(np.degrees(np.linalg.norm(difference[:3]))), float(np.linalg.norm(difference[3:]))
     if not back.converged or shift > settings.max_disagreement_m or turn > settings.max_disagreement_deg:
         return f"forward and backward registration disagree by {shift:.2f} m, {turn:.1f} deg"
+    return ""
+
+
+def _other_ground(
+    settings: VerificationSettings, e: Evidence, own: VoxelMap, target: Target, j: Submap
+) -> str:
+    """The relief of both passes must agree as well as passes do, measured by each of the two."""
+    here = unevenness_m(e.registration)
+    usual = max(unevenness_m(itself(own, j)), unevenness_m(itself(target.fine, target.submap)))
+    if here > settings.max_unevenness * usual:
+        return (
+            f"another relief: the ground differs by {100 * here:.1f} cm where {100 * usual:.1f} cm are usual"
+        )
     return ""
 
 
