@@ -14,7 +14,7 @@ from scanloom.stages.geometry.se3 import F8, inverse
 METHODS = ("least_squares", "cauchy")
 CLOCK_OFFSET_S = -0.6
 """The data's own description says so; it takes the antenna to be where the LiDAR is."""
-ODOMETRY_SIGMA = np.repeat([np.radians(0.1), 0.05], 3)
+ODOMETRY_SIGMA = np.repeat([np.radians(0.05), 0.03], 3)
 FIX_SIGMA_M = np.array([1.0, 1.0, 2.0])
 
 
@@ -24,7 +24,8 @@ def solve(method: str, T: F8, stamp_ns: NDArray[np.int64], fix_ns: NDArray[np.in
 
     at = fix_ns + round(CLOCK_OFFSET_S * 1e9)
     known = np.flatnonzero(inside(stamp_ns, at))
-    node = np.clip(np.searchsorted(stamp_ns, at[known]), 0, len(T) - 1)
+    middle = (stamp_ns[1:] + stamp_ns[:-1]) // 2
+    node = np.searchsorted(middle, at[known])
     start = umeyama(fix_m[known], T[node, :3, 3]) @ T
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     steps = gtsam.noiseModel.Diagonal.Sigmas(ODOMETRY_SIGMA)
