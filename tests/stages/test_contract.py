@@ -26,6 +26,8 @@ WITHOUT_INPUT = {"simulate"}
 """Makes its own input."""
 
 CONTENT_WITH_NOTHING = {
+    "base",
+    "changes",
     "truth",
     "overview",
     "tiles",
@@ -168,6 +170,9 @@ def _blank_attributes(product: type[Table]) -> dict[str, Any]:
         "georeference": None,
         "source": "none",
         "sessions": (),
+        "warnings": (),
+        "remarks": (),
+        "remnants": 0,
         "offset_m": (0.0, 0.0, 0.0),
     }
     return {name: blanks.get(name, 0.1) for name in attributes_of(product)}
