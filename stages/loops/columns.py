@@ -32,7 +32,8 @@ def columns(points: F8, low_m: float, margin: int) -> tuple[F8, U8]:
     grid = np.zeros((CELLS, CELLS), np.uint64)
     _occupy(np.ascontiguousarray(points), low_m, 0, margin, grid)
     u, v = np.nonzero(grid)
-    return (np.column_stack((u, v)) - HALF_CELLS + 0.5) * CELL_M, grid[u, v]
+    middles: F8 = (np.column_stack((u, v)).astype(np.float64) - HALF_CELLS + 0.5) * CELL_M
+    return middles, grid[u, v]
 
 
 def pyramid(points: F8, low_m: float) -> U8:

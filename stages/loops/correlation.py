@@ -55,7 +55,7 @@ class Prior:
 
     @property
     def all_around(self) -> bool:
-        return self.reach_yaw_rad > np.pi - 0.5 * YAW_STEP_RAD
+        return bool(self.reach_yaw_rad > np.pi - 0.5 * YAW_STEP_RAD)
 
     @property
     def reach(self) -> tuple[int, int]:
@@ -138,7 +138,8 @@ def _search(
 @kernel
 def _roots(grid: U8, cells: I4, bits: U8, reach: Int, reach_z: Int, window: I8, least: Int) -> tuple[I8, Int]:
     """A queue of the largest boxes, which fill the window."""
-    queue, waiting = np.empty(1 << 14, np.int64), 0
+    queue = np.empty(1 << 14, np.int64)
+    waiting: Int = 0
     step = 1 << TOP_LEVEL
     for a in range(window[0]):
         for x in range(0, window[1], step):
@@ -188,7 +189,8 @@ def _beaten(gone: NDArray[np.bool_], window: I8, place: I8, around: bool) -> boo
 def _key(bound: Int, level: Int, a: Int, x: Int, y: Int, z: Int, window: I8) -> Int:
     index = ((a * window[1] + x) * window[2] + y) * window[3] + z
     box = 1 if level > 0 else 0
-    return (bound << BOUND_BIT) | (box << BOX_BIT) | (level << LEVEL_BIT) | (INDEX_MASK - index)
+    key: Int = (bound << BOUND_BIT) | (box << BOX_BIT) | (level << LEVEL_BIT) | (INDEX_MASK - index)
+    return key
 
 
 @kernel
@@ -219,7 +221,8 @@ def _wait(queue: I8, waiting: Int, key: Int) -> tuple[I8, Int]:
 @kernel
 def _first(queue: I8, waiting: Int) -> Int:
     """Take the largest key out of a heap of `waiting` keys."""
-    first, last = queue[0], queue[waiting - 1]
+    first: Int = queue[0]
+    last = queue[waiting - 1]
     at, below = 0, 1
     while below < waiting - 1:
         if below + 1 < waiting - 1 and queue[below + 1] > queue[below]:

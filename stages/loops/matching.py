@@ -124,14 +124,14 @@ def refined(settings: MatchingSettings, target: Target, j: Submap, found: Sequen
     """Distinct poses to which the peaks lead, best first."""
     thin = upright(j)
     thin = thin[downsample(thin, 0.8)]
-    rough: list[tuple[float, F8]] = []
+    reached: list[tuple[float, F8]] = []
     for peak in found:
-        T = _rough(target, j, peak.T_i_j).T_target_source
-        if all(not same(T, other) for _, other in rough):
-            rough.append((_fit(settings, target, thin, T), T))
-    best = max((fit for fit, _ in rough), default=0.0)
+        T = rough(target, j, peak.T_i_j).T_target_source
+        if all(not same(T, other) for _, other in reached):
+            reached.append((_fit(settings, target, thin, T), T))
+    best = max((fit for fit, _ in reached), default=0.0)
     out: list[Match] = []
-    for fit, T in sorted(rough, key=lambda each: -each[0]):
+    for fit, T in sorted(reached, key=lambda each: -each[0]):
         if fit < DROPPED_SHARE * best:
             break
         r = fine(target.fine, j, T)
@@ -158,7 +158,8 @@ def same(a: F8, b: F8) -> bool:
     return bool(np.linalg.norm(xi[3:]) <= SAME_M and np.linalg.norm(xi[:3]) <= SAME_RAD)
 
 
-def _rough(target: Target, j: Submap, T: F8) -> Registration:
+def rough(target: Target, j: Submap, T: F8) -> Registration:
+    """The first registration, which reaches 2 m far."""
     return align(target.coarse, _thin(j, 1.5), T, max_distance_m=2.0, scale_m=0.6, max_iterations=15)
 
 

@@ -7,6 +7,7 @@ these it must overlap, be distinct, see every direction, show the same relief, a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +18,10 @@ from scanloom.stages.geometry.registration import Registration, VoxelMap
 from scanloom.stages.geometry.se3 import F8, inverse, se3_log, transform
 from scanloom.stages.geometry.voxels import downsample
 from scanloom.stages.loops.candidates import Candidate
-from scanloom.stages.loops.indicators import comparable, displaced, inliers, overlap, unevenness_m
+from scanloom.stages.loops.correlation import Peak
+from scanloom.stages.loops.indicators import comparable, displaced, inliers, overlap, unevenness_m, upright
 from scanloom.stages.loops.matching import (
+    LEAST_UPRIGHT,
     Match,
     MatchingSettings,
     Target,
@@ -144,12 +147,19 @@ class Evidence:
 
 def verify(settings: VerificationSettings, c: Candidate, path_m: float, i: Submap, j: Submap) -> Verdict:
     """Pose of LiDAR j in LiDAR i and whether to believe it. `path_m` is the path driven in between (0 between sessions)."""
-    found = proposals(settings, i, j, prior_of(settings, c.predicted, c.yaw_rad, i, j))
+    prior = prior_of(settings, c.predicted, c.yaw_rad, i, j)
+    return decide(settings, c, path_m, i, j, proposals(settings, i, j, prior))
+
+
+def decide(
+    settings: VerificationSettings, c: Candidate, path_m: float, i: Submap, j: Submap, found: Sequence[Peak]
+) -> Verdict:
+    """The second stage alone: what becomes of the peaks that the search has found."""
     if not found:
-        return _nothing("nothing upright to compare")
+        bare = min(len(upright(i)), len(upright(j))) < LEAST_UPRIGHT
+        return _nothing("nothing upright to compare" if bare else "nowhere do the submaps look alike")
     target = Target(i)
-    matches = refined(settings, target, j, found)
-    e = _evidence(settings, matches, target, j)
+    e = _evidence(settings, refined(settings, target, j, found), target, j)
     reason = _refusal(settings, e, c, path_m, target, j)
     r = e.registration
     return Verdict(
