@@ -12,6 +12,8 @@ Truth is used here alone, and only where there is some:
   in an earlier session, and have a true loop in use within 10 m of path.
 * `loops.search_rN_*`: the search alone, over thresholds of the descriptor's distance. A candidate is right when its two
   scans lie within N m (3, 4, 5, 10); recall is that of the keyframes as above, with right candidates in place of loops.
+* `gnss.wrong_fixes`: fixes off by more than 1 m and five times what their receiver claims; `gnss.wrong_used`: those of them
+  that the graph uses; `gnss.used_error_*`: what the fixes in use are truly off by.
 
 Without truth: `odometry.degenerate_*`, where a direction was not seen beyond noise; `gnss.*`, what became of the fixes by
 the receiver's own status and how far they lie from the antenna of the finished map; `sensors.*`; `map.*`, mean map entropy.
@@ -36,7 +38,7 @@ from scanloom.schemas.trajectory import Odometry, Poses, Truth
 from scanloom.stages.evaluation.crispness import map_figures
 from scanloom.stages.evaluation.degenerate import degeneracy_figures
 from scanloom.stages.evaluation.figures import Figure, to_metrics
-from scanloom.stages.evaluation.fixes import fix_figures
+from scanloom.stages.evaluation.fixes import fix_figures, true_fix_figures
 from scanloom.stages.evaluation.loops import judged, loop_figures
 from scanloom.stages.evaluation.paths import TruePath, true_paths
 from scanloom.stages.evaluation.revisits import revisits
@@ -129,6 +131,8 @@ def _session_figures(name: str, given: _Given, fixes: dict[str, FixRows]) -> Ite
         yield from fix_figures(given.gnss[name], fixes[name], poses.georeference is not None)
     if name in given.truths and len(given.truths[name]):
         yield from truth_figures(given.truths[name], odometry, poses)
+        if name in fixes and name in given.gnss:
+            yield from true_fix_figures(given.gnss[name], fixes[name], poses, given.truths[name])
 
 
 def _loop_figures(

@@ -46,7 +46,7 @@ def truth_figures(truth: Truth, odometry: Odometry, poses: Poses) -> Iterator[Fi
 
 def _map_figures(truth: Truth, true: F8, poses: Poses) -> Iterator[Figure]:
     """Errors on the Earth, and whether the marginal covariances tell the truth of the errors."""
-    T_world_truth = _on_earth(truth, poses)
+    T_world_truth = on_earth(truth, poses)
     if T_world_truth is None:
         T_world_truth = alignment.umeyama(poses.T_world_lidar[:, :3, 3], true[:, :3, 3])
         how = "truth aligned as a whole"
@@ -116,7 +116,7 @@ def _absolute_figures(errors: F8) -> Iterator[Figure]:
     yield Figure("fusion.absolute_max_m", float(errors.max()), "m", f"largest {how}")
 
 
-def _on_earth(truth: Truth, poses: Poses) -> F8 | None:
+def on_earth(truth: Truth, poses: Poses) -> F8 | None:
     """T_world_truth (4, 4) where both the map and truth stand on the Earth, else None."""
     if poses.georeference is None or truth.georeference is None:
         return None

@@ -64,6 +64,36 @@ def test_fixes_are_told_apart_by_what_the_receiver_said() -> None:
     assert "gnss.status_-1.residual_median_m" not in figures
 
 
+def test_wrong_fixes_are_known_by_truth_whatever_the_solution_makes_of_them() -> None:
+    """The map is 2 m off to the north; fixes are where they are, and residuals are to the map's antenna."""
+    T = laps(40)
+    moved = T.copy()
+    moved[:, 1, 3] += 2.0
+    error = np.zeros((40, 3))
+    error[10:20, 0] = 5.1  # wrong: claimed within a metre
+    error[20:30, 0] = 4.9  # five times what is claimed, and not more
+    error[35:, :] = np.nan
+    residual = np.array([0.0, 2.0, 0.0]) - error
+    verdicts = ["used"] * 12 + ["lies"] * 28
+    graph = fixes_graph(T[:, :3, 3] + error, residual, verdicts)
+    truth = {"a": replace(truth_of(T), georeference=HERE.model_dump())}
+    poses = {"a": poses_of(moved, georeference=HERE.model_dump())}
+    gnss = gnss_of(T[:, :3, 3], np.full(40, 2))
+    figures = figures_of(T=T, truth=truth, poses=poses, graph=graph, gnss=gnss)
+    assert figures["gnss.wrong_fixes"] == 10
+    assert figures["gnss.wrong_used"] == 2
+    assert figures["gnss.used_error_median_m"] == pytest.approx(0.0, abs=1e-6)
+    assert figures["gnss.used_error_p95_m"] == pytest.approx(5.1, abs=1e-6)
+    sure = replace(
+        gnss, covariance_m2=np.zeros((40, 3, 3))
+    )  # a receiver that does not tell: more than a metre is wrong
+    assert figures_of(T=T, truth=truth, poses=poses, graph=graph, gnss=sure)["gnss.wrong_fixes"] == 20
+    late = {"a": truth["a"].take(slice(30, None))}
+    assert figures_of(T=T, truth=late, poses=poses, graph=graph, gnss=gnss)["gnss.wrong_fixes"] == 0
+    nowhere = figures_of(T=T, poses=poses, graph=graph, gnss=gnss)
+    assert "gnss.wrong_fixes" not in nowhere
+
+
 def test_without_a_georeference_fixes_have_no_residuals() -> None:
     T = laps(20)
     graph = fixes_graph(T[:, :3, 3], np.ones((20, 3)), ["too few good fixes"] * 20)
