@@ -13,6 +13,10 @@ from scanloom.stages.report.figures import Figures, number
 Level = Literal["pass", "note", "warn", "fail"]
 
 
+BLIND_WAY_M = 5.0
+"""Shorter ways without a view of every direction are not worth a word."""
+
+
 @dataclass(frozen=True)
 class Check:
     """One thing looked at: how it went, in a sentence."""
@@ -69,12 +73,17 @@ def _map_checks(limits: Limits, sessions: Iterable[str], figures: Figures) -> It
         yield Check("fail", "The map holds no points.")
     accepted = figures.get("loops.accepted") or 0
     precision = figures.get("loops.precision")
+    level: Level
     if precision is not None and precision < 1.0:
         yield Check("fail", f"{100 * (1 - precision):.1f} % of the accepted loops are wrong.")
     elif precision is not None:
         yield Check("pass", "All accepted loops that truth can judge are right.")
     elif accepted:
         yield Check("pass", f"{number(accepted)} loops hold the map together.")
+    apart_m = figures.get("fusion.inter_session_rmse_m")
+    if apart_m is not None:
+        level = _level(apart_m, limits.ate_warn_m, 10 * limits.ate_warn_m)
+        yield Check(level, f"Sessions lie within {apart_m:.2f} m of each other where they meet, by truth.")
     georeferenced = bool(figures.get("fusion.georeferenced"))
     if not georeferenced:
         yield Check(
@@ -82,7 +91,7 @@ def _map_checks(limits: Limits, sessions: Iterable[str], figures: Figures) -> It
         )
     if not georeferenced and not accepted:
         path_m = sum(figures.get("fusion.path_length_m", name) or 0.0 for name in sessions)
-        level: Level = "warn" if path_m > limits.open_path_warn_m else "note"
+        level = "warn" if path_m > limits.open_path_warn_m else "note"
         yield Check(level, "Neither GNSS nor a loop bounds the drift: accuracy falls with distance driven.")
 
 
@@ -115,8 +124,26 @@ def _session_checks(
     if gnss_m is not None:
         level = _level(gnss_m, limits.gnss_warn_m, limits.gnss_fail_m)
         yield Check(level, f"{name}: poses and GNSS agree to {gnss_m:.2f} m (median, horizontal).")
+    yield from _blind_checks(name, figures)
     yield from _truth_checks(limits, name, figures)
     yield from _input_checks(name, session)
+
+
+def _blind_checks(name: str, figures: Figures) -> Iterator[Check]:
+    """Where odometry guessed: the other sensors and loops had to decide."""
+    longest_m = figures.get("odometry.degenerate_longest_m", name) or 0.0
+    if longest_m >= BLIND_WAY_M:
+        share = 100 * (figures.get("odometry.degenerate_share", name) or 0.0)
+        yield Check(
+            "note",
+            f"{name}: {share:.1f} % of the scans did not see every direction of motion, over {longest_m:.0f} m at the longest.",
+        )
+    segments = figures.get("odometry.segments", name)
+    if segments:
+        yield Check(
+            "note",
+            f"{name}: odometry lost the motion and began anew {number(segments - 1)} time{'s' * (segments > 2)}.",
+        )
 
 
 def _truth_checks(limits: Limits, name: str, figures: Figures) -> Iterator[Check]:
@@ -124,6 +151,9 @@ def _truth_checks(limits: Limits, name: str, figures: Figures) -> Iterator[Check
     if ate is not None:
         level = _level(ate, limits.ate_warn_m, 10 * limits.ate_warn_m)
         yield Check(level, f"{name}: trajectory within {ate:.2f} m of truth (ATE, root mean square).")
+    believed = figures.get("gnss.wrong_used", name)
+    if believed:
+        yield Check("warn", f"{name}: {number(believed)} GNSS fixes in use are wrong.")
     drift = figures.get("odometry.kitti_t_rel_percent", name)
     if drift is not None:
         level = _level(drift, limits.drift_warn_percent, 5 * limits.drift_warn_percent)

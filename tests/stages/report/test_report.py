@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
-from html.parser import HTMLParser
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from scanloom.stages.evaluation.stage import Settings as EvaluationSettings
 from scanloom.stages.geometry.geodesy import georeference
 from scanloom.stages.report import picture, report
 from scanloom.stages.report.map_picture import Settings as PictureSettings
-from scanloom.stages.report.page import compose, fleet_page, run_section
+from scanloom.stages.report.page import compose, run_section
 from scanloom.stages.report.stage import Settings
 from scanloom.stages.tiling import overview
 from scanloom.stages.tiling.overview import Settings as OverviewSettings
@@ -43,42 +42,9 @@ from tests.stages.mapping import (
     tiles_of,
     truth_of,
 )
+from tests.stages.report.parsing import parse
 from tests.stages.report.test_along import changes_of
 from tests.worlds import drive, street
-
-VOID = {"meta", "img", "link", "br", "hr"}
-
-
-class Balanced(HTMLParser):
-    """Fails on tags that do not match; keeps the text, and every address that is asked for."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.text = ""
-        self.addresses: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag not in VOID:
-            self.open.append(tag)
-        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        pass
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-
-
-def parse(page: str) -> Balanced:
-    parser = Balanced()
-    parser.feed(page)
-    assert parser.open == []
-    return parser
-
 
 DRAWN = ("poses", "loops", "graph", "tile_index", "tiles")
 
@@ -229,57 +195,6 @@ def test_two_sessions_have_two_colours_and_two_tables(street_map: Map) -> None:
     page = body(files)
     assert page.count("<polyline") >= 4
     parse(page)
-
-
-def test_run_section_shows_times_and_provenance() -> None:
-    rows = [
-        {"stage": "deskew", "tasks": 3, "executed": 2, "wall_s": 4.0, "peak_rss_mb": 310.4},
-        {"stage": "odometry", "tasks": 1, "executed": 0, "wall_s": 0.0, "peak_rss_mb": 0.0},
-    ]
-    section = run_section(rows, {"scanloom": "0.1.0"})
-    text = parse(section).text
-    assert "width: 100.0%" in section
-    assert "4.00" in text
-    assert "310" in text
-    assert "0.1.0" in text
-
-
-def metric(name: str, value: float, previous: float | None, session: str = "") -> dict[str, Any]:
-    return {
-        "name": name,
-        "value": value,
-        "unit": "",
-        "scope": "map",
-        "session": session,
-        "previous": previous,
-    }
-
-
-def test_fleet_page_shows_changes_failures_and_links() -> None:
-    rows = [
-        {
-            "map": "harbour", "sessions": ["mon", "tue"], "delivered": True, "report": "maps/harbour/report.html",
-            "new": False, "warnings": ["tue: clock jumps"], "failures": [],
-            "metrics": [
-                metric("fusion.ate_rmse_m", 0.2, 0.3, "mon"), metric("fusion.ate_rmse_m", 0.4, 0.3, "tue"),
-                metric("map.points", 2000.0, 1000.0),
-            ],
-        },
-        {
-            "map": "depot", "sessions": ["x.bag"], "delivered": False, "report": None, "new": True, "warnings": [],
-            "failures": ["x.bag: holds no 3D LiDAR"], "metrics": [],
-        },
-    ]  # fmt: skip
-    page = fleet_page(rows, made="today")
-    parser = parse(page)
-    assert parser.addresses == ["maps/harbour/report.html"]
-    assert page.count('class="change better"') == 1
-    assert page.count('class="change worse"') == 1
-    assert page.count('class="change soft"') == 1
-    assert "x.bag: holds no 3D LiDAR" in parser.text
-    assert "clock jumps" in parser.text
-    assert "1 of 2" in parser.text
-    parse(fleet_page([], made="today"))
 
 
 def test_what_the_scans_said_of_the_sensors_is_told_and_escaped(street_map: Map) -> None:
