@@ -22,11 +22,9 @@ from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.geometry.interpolation import interpolate_poses
 from scanloom.stages.geometry.rig import corrected
 from scanloom.stages.geometry.se3 import F8, adjoint, inverse
+from scanloom.stages.geometry.unseen import SEEN_P
 
 I8 = NDArray[np.int64]
-
-SEEN_P = 0.5
-"""Directions observed beyond noise with a smaller probability were not seen."""
 
 UNKNOWN_STEP_SIGMA = (np.radians(5.0), 1.0)
 """Rotation rad, translation m assumed for a step whose covariance odometry does not know."""

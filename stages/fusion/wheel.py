@@ -13,11 +13,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from scanloom.stages.fusion.drives import I8, SEEN_P, Drive
+from scanloom.stages.fusion.drives import I8, Drive
 from scanloom.stages.fusion.settings import WheelSettings
 from scanloom.stages.geometry.motion import MotionTrack
 from scanloom.stages.geometry.se3 import F8, inverse, so3_log
 from scanloom.stages.geometry.traction import Traction, WheelScale, without_slips
+from scanloom.stages.geometry.unseen import SEEN_P
 
 LEAST_STEP_M = 0.5
 MOST_SCALE_ERROR = 0.1
