@@ -20,9 +20,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import bicocca, costs
+from benchmarks import bicocca, costs, outage
 from benchmarks.scores import Figure
 
+STORE = Path("build/bench/store")
 console = Console(stderr=True, width=160)
 
 
@@ -74,6 +75,10 @@ def _kitti(data: Path) -> Iterator[Figure]:
     yield from _if_there(data / "kitti_00_trajectory", lambda folder: module.figures(folder.parent))
 
 
+def _outage(_: Path) -> Iterator[Figure]:
+    yield from outage.figures(STORE)
+
+
 def _if_there(path: Path, figures: Callable[[Path], Iterator[Figure]]) -> Iterator[Figure]:
     if path.exists():
         yield from figures(path)
@@ -85,6 +90,7 @@ PARTS: dict[str, Callable[[Path], Iterator[Figure]]] = {
     "bicocca": _bicocca,
     "costs": _costs,
     "kitti": _kitti,
+    "outage": _outage,
 }
 
 
