@@ -22,7 +22,7 @@ from scanloom.schemas.frames import Georeference
 from scanloom.schemas.product import Parts
 from scanloom.schemas.trajectory import Poses
 from scanloom.stages.fusion.factors import Factor
-from scanloom.stages.geometry.se3 import F8, inverse, se3_exp, se3_log
+from scanloom.stages.geometry.se3 import F8, adjoint, inverse, se3_exp, se3_log
 
 I8 = NDArray[np.int64]
 
@@ -119,6 +119,24 @@ def settled(solved: Poses, base: Base, *, rigid: bool, deadband_m: float) -> Pos
     T[stays] = before[stays]
     covariance = np.where(stays[:, None, None], base.covariance[rows], solved.covariance)
     return replace(solved, T_world_lidar=T, covariance=covariance)
+
+
+def inherited(solved: Poses, old: BaseMap) -> Poses:
+    """Poses of a new session in `rigid` mode, with the map's own uncertainty added to their marginals.
+
+    To the solver the map's poses are facts, so that it tells how well the session lies on the map. An error xi of the old
+    keyframe j nearest to pose i moves i with it: C_i + A C_j A^T, A = Ad(T_i^-1 T_j).
+    """
+    from scipy.spatial import cKDTree
+
+    nodes = [part.take(np.flatnonzero(part.keyframe)) for part in old.sessions.values()]
+    T_old = np.concatenate([part.T_world_lidar for part in nodes])
+    C_old = np.concatenate([part.covariance for part in nodes])
+    if not len(T_old):
+        return solved
+    j = cKDTree(T_old[:, :3, 3]).query(solved.T_world_lidar[:, :3, 3])[1]
+    A = adjoint(inverse(solved.T_world_lidar) @ T_old[j])
+    return replace(solved, covariance=solved.covariance + A @ C_old[j] @ np.swapaxes(A, 1, 2))
 
 
 def _moved(motion: F8) -> F8:

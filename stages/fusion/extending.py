@@ -8,7 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from scanloom.schemas.trajectory import Poses
-from scanloom.stages.fusion.base import BaseMap, fixing, known_poses, remark_on_ties, settled, start_poses
+from scanloom.stages.fusion.base import (
+    BaseMap,
+    fixing,
+    inherited,
+    known_poses,
+    remark_on_ties,
+    settled,
+    start_poses,
+)
 from scanloom.stages.fusion.drives import I8, Drive
 from scanloom.stages.fusion.factors import Factor
 from scanloom.stages.fusion.gnss import Fixes
@@ -80,9 +88,11 @@ def _old_nodes(drives: Sequence[Drive], old: BaseMap) -> tuple[I8, F8]:
 
 def final(settings: Settings, name: str, solved: Poses, old: BaseMap | None) -> Poses:
     """Poses of a session as the new map has them."""
-    if old is None or not old.holds(name):
+    if old is None:
         return solved
     rigid = settings.extension == "rigid"
+    if not old.holds(name):
+        return inherited(solved, old) if rigid else solved
     return settled(solved, old.sessions[name], rigid=rigid, deadband_m=settings.extension_deadband_m)
 
 

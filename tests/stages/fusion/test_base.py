@@ -208,6 +208,18 @@ def test_bases_in_different_frames_are_refused() -> None:
         )  # fmt: skip
 
 
+def test_new_poses_are_no_surer_than_the_map_they_lie_on() -> None:
+    gnss = gnss_of(FIRST_DAY, sigma=0.5)
+    base = first_map("a", gnss)
+    poses, _ = fuse("a", "b", ties("a", "b", EVERYWHERE), base=base, gnss=gnss)
+    at = np.linalg.norm(
+        base.T_world_lidar[:, None, :3, 3] - poses["b"].T_world_lidar[None, ::50, :3, 3], axis=2
+    )
+    of_map = np.trace(base.covariance[at.argmin(axis=0), 3:, 3:], axis1=1, axis2=2)
+    of_new = np.trace(poses["b"].covariance[::50, 3:, 3:], axis1=1, axis2=2)
+    assert (of_new > 0.9 * of_map).all() and (of_new < 3.0 * of_map + 0.1).all()
+
+
 # --- soft -----------------------------------------------------------------------------------------------------------
 
 
