@@ -42,11 +42,11 @@ def main() -> None:
     first = _made(Order((OLD,), folder / "maps" / OLD, OLD, folder / "store", workers=options.workers))
     parent = read_parent(first.out)
     order = extension_order(
-        parent, [NEW], out=folder / "maps" / f"{OLD}-{options.mode}", store=folder / "store", mode=options.mode,
-        project={}, command_line={}, workers=options.workers,
+        parent, [NEW], out=folder / "maps" / f"{OLD}-{options.mode}-{options.seed}", store=folder / "store",
+        mode=options.mode, project={}, command_line={"simulate": _second_day(options)}, workers=options.workers,
     )  # fmt: skip
     second = _made(order)
-    figures = list(_figures(first, second, options.mode))
+    figures = list(_figures(first, second, options.mode, options.seed))
     rows = [figure.row() for figure in figures if np.isfinite(figure.value)]
     if options.json == "-":
         print(json.dumps(rows, indent=1))
@@ -67,8 +67,20 @@ def _options() -> argparse.Namespace:
     )
     parser.add_argument("--mode", choices=("rigid", "soft"), default="rigid")
     parser.add_argument("--workers", type=int)
+    parser.add_argument(
+        "--seed", type=int, default=1, help="of the second day: sensors, traffic and parked cars"
+    )
+    parser.add_argument("--start", type=float, help="where on the lap the second day starts, m")
+    parser.add_argument("--length", type=float, help="how long the second day's drive takes, s")
     parser.add_argument("--json", default="", help="file, or - for standard output")
     return parser.parse_args()
+
+
+def _second_day(options: argparse.Namespace) -> dict[str, float]:
+    """What is changed of the second session."""
+    told = {"start_m": options.start, "duration_s": options.length}
+    changed = {name: value for name, value in told.items() if value is not None}
+    return changed if options.seed == 1 else {"seed": options.seed, "parking_seed": options.seed, **changed}
 
 
 def _made(order: Order) -> Outcome:
@@ -78,7 +90,7 @@ def _made(order: Order) -> Outcome:
     return outcome
 
 
-def _figures(first: Outcome, second: Outcome, mode: str) -> Iterator[Figure]:
+def _figures(first: Outcome, second: Outcome, mode: str, day: int) -> Iterator[Figure]:
     if second.result is None:
         return
     result = second.result
@@ -88,7 +100,7 @@ def _figures(first: Outcome, second: Outcome, mode: str) -> Iterator[Figure]:
 
     yield from (figure(*row) for row in _fit(result))
     yield from (figure(*row) for row in _kept(first, second))
-    yield from (figure(*row) for row in _cars(result))
+    yield from (figure(*row) for row in _cars(result, day))
     yield figure("changes.points", sum(map(len, result.parts(Changes))), "", "points reported as gone")
     yield figure("tasks.executed", second.executed, "", f"of {len(result.tasks)} tasks of the extension")
 
@@ -140,7 +152,7 @@ def _files(tile: str) -> tuple[str, str]:
     return f"tiles/{tile}.parquet", f"tiles/{tile}.ply"
 
 
-def _cars(result: Result) -> Iterator[Row]:
+def _cars(result: Result, day: int) -> Iterator[Row]:
     """Parked cars that left, by the simulator's own lists of cars."""
     changes = result.parts(Changes)[0]
     points = np.column_stack((changes.x_m, changes.y_m, changes.z_m))
@@ -150,7 +162,7 @@ def _cars(result: Result) -> Iterator[Row]:
     in_town = points @ T_town_map[:3, :3].T + T_town_map[:3, 3]
     new_path = (T_town_map @ poses[NEW].T_world_lidar)[:, :3, 3]
     asked = _asked(result, T_town_map)
-    scores = gone_scores(bays(), in_town, changes.object_, asked, new_path)
+    scores = gone_scores(bays(second_day=day), in_town, changes.object_, asked, new_path)
     yield (
         "cars.left",
         scores.left,

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from scanloom.schemas.errors import UsageError
 from scanloom.workflows.configuration import checked_overrides
-from scanloom.workflows.sessions import SAMPLE, map_name
+from scanloom.workflows.sessions import SIMULATED_SESSIONS, map_name
 
 
 class MapEntry(BaseModel):
@@ -79,7 +79,7 @@ def sessions_by_map(fleet: Fleet, base: Path) -> dict[str, list[str]]:
 
 
 def _expand(pattern: str, base: Path) -> list[str]:
-    if pattern == SAMPLE:
+    if pattern in SIMULATED_SESSIONS:
         return [pattern]
     full = str(base / pattern)
     return sorted(glob.glob(full)) or [full]
