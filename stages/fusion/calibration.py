@@ -32,7 +32,9 @@ MOVED_M = 0.3
 MOST_WINDOWS = 300
 MOST_IN_WINDOW = 40
 KERNELS_M = (3.0, 3.0, 1.5, 1.5, 0.8, 0.8, 0.5, 0.5, 0.5, 0.5)
-"""Width of the kernel in each round: residuals of this size weigh a quarter."""
+"""Least width of the kernel in each round: residuals of this size weigh a quarter."""
+KERNEL_TYPICAL = 5.0
+"""Width of the kernel in typical residuals: a narrower one confirms whatever it starts from."""
 NEAR_M = 2.0
 VELOCITY_BASE_NS = 100_000_000
 COMMON = 4
@@ -92,6 +94,8 @@ class _Reduced:
     score: F8
     square: float
     weight: float
+    typical_m: float
+    """Median distance of its fixes."""
 
 
 def calibrate(motions: Sequence[Motion], antenna_m: F8, base: F8, start: F8, sigma: F8) -> Calibration | None:
@@ -106,7 +110,9 @@ def calibrate(motions: Sequence[Motion], antenna_m: F8, base: F8, start: F8, sig
     places = [_windows(motion, start[0]) for motion in motions]
     x, prior = start.copy(), np.diag(1.0 / sigma**2)
     poses: dict[tuple[int, int], tuple[complex, complex]] = {}
-    for kernel_m in KERNELS_M:
+    found: list[_Reduced] = []
+    for least_m in KERNELS_M:
+        kernel_m = max(least_m, KERNEL_TYPICAL * float(np.median([r.typical_m for r in found] or [0.0])))
         found = []
         for m, (motion, rows) in enumerate(zip(motions, places, strict=True)):
             for k, window in enumerate(_filled(motion, rows, x, antenna_m, base)):
@@ -123,9 +129,15 @@ def calibrate(motions: Sequence[Motion], antenna_m: F8, base: F8, start: F8, sig
 
 
 def _covariance(H: F8, prior: F8, found: Sequence[_Reduced], variance: float) -> F8:
-    """Sandwich over windows, with the usual correction for few of them; at least what H itself says."""
-    few = len(found) / (len(found) - COMMON)
-    spread = prior + few * sum(np.outer(r.score, r.score) for r in found) / variance**2
+    """Sandwich over windows, each taken as if left out (jackknife, CR3), and at least what H itself says.
+
+    The windows that tell most, with turns and changes of speed, are few; what remains of them after the fit says too little.
+    """
+    spread = prior.copy()
+    for r in found:
+        rest = np.eye(COMMON) - np.linalg.solve(H, r.information / variance).T
+        score = np.linalg.solve(rest, r.score / variance)
+        spread += np.outer(score, score)
     covariance = np.linalg.solve(H, np.linalg.solve(H, spread).T)
     least = np.diag(np.linalg.inv(H))
     scale = np.sqrt(np.maximum(least / np.diag(covariance), 1.0))
@@ -230,6 +242,7 @@ def _reduced(window: _Window, pose: tuple[complex, complex], kernel_m: float) ->
         b[c] - N[c, o] @ d,
         float(w @ left**2),
         float(max(w.sum() - 3.0, 1.0)),
+        float(np.median(np.abs(residual))),
     )
 
 

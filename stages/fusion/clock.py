@@ -63,8 +63,8 @@ def _chords(motion: Motion) -> tuple[I8, I8]:
     return i.astype(np.int64), j[i].astype(np.int64)
 
 
-CLEAR = 4.0
-LEAST_OFFSET_S = 0.01
+CLEAR = 5.0
+LEAST_OFFSET_S = 0.02
 LARGEST_SIGMA_S = 0.05
 
 

@@ -8,8 +8,8 @@ from scanloom.schemas.session import Extrinsic, Session
 from scanloom.stages.fusion.calibration import Calibration
 from scanloom.stages.geometry.se3 import F8
 
-CLEAR_SQUARE = 18.4
-"""Chi-square of two unknowns at 99.99 %: an antenna that is not at the assumed place."""
+CLEAR_SQUARE = 30.0
+"""Five standard deviations and some: errors of GNSS last, and look like an antenna for a while."""
 LARGEST_SIGMA_M = 0.3
 ASSUMED = "assumed identity"
 
@@ -20,9 +20,10 @@ def told(session: Session) -> bool:
 
 
 def clear(found: Calibration) -> bool:
-    """The antenna is known well enough, and not where it was assumed."""
+    """The antenna is known well enough, and further from where it was assumed than fixes scatter."""
     shift, C = found.value[1:3], found.covariance[1:3, 1:3]
-    return bool(found.sigma[1:3].max() < LARGEST_SIGMA_M and shift @ np.linalg.solve(C, shift) > CLEAR_SQUARE)
+    sure = found.sigma[1:3].max() < LARGEST_SIGMA_M and shift @ np.linalg.solve(C, shift) > CLEAR_SQUARE
+    return bool(sure and np.linalg.norm(shift) > found.rms_m)
 
 
 def with_antenna(session: Session, shift_m: F8) -> Session:

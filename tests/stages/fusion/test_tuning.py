@@ -22,6 +22,7 @@ from tests.stages.fusion.drives import (
     ANTENNA,
     START_NS,
     World,
+    gnss_at,
     gnss_of,
     odometry_of,
     parts,
@@ -154,6 +155,33 @@ def test_no_offset_is_looked_for_beyond_the_bound() -> None:
     assert abs(beyond) <= 2.0
     switched_off, *_ = tune(session, gnss, late_s=0.6, most_s=0.0)
     assert switched_off == 0.0
+
+
+def wandering_gnss(seed: int, antenna: tuple[float, ...], sigma: float = 0.5, tau_s: float = 5.0) -> Gnss:
+    """Fixes once a second whose error lasts for seconds, as a receiver's does."""
+    rng, every = np.random.default_rng(seed), 10
+    T = WORLD.T[::every]
+    error, keep = rng.normal(0.0, sigma, (len(T), 3)), np.exp(-1.0 / tau_s)
+    for k in range(1, len(T)):
+        error[k] = keep * error[k - 1] + np.sqrt(1.0 - keep**2) * error[k]
+    return gnss_at(WORLD.stamp_ns[::every], T[:, :3, :3] @ np.array(antenna) + T[:, :3, 3] + error, sigma)
+
+
+def test_errors_that_last_are_not_taken_for_a_clock_or_an_antenna() -> None:
+    """It is at the base, where a silent log is taken to have it; hardly ever moved, and by less than fixes are off."""
+    session, moved = silent(session_of("a", WORLD)), []
+    for seed in range(8):
+        offset, antenna, _ = tune(session, wandering_gnss(seed, (-0.5, 0.0, -1.7)))
+        assert offset == 0.0
+        moved.append(float(np.linalg.norm(antenna - [-0.5, 0.0, -1.7])))
+    assert np.count_nonzero(np.array(moved) > 1e-9) <= 2
+    assert max(moved) < 0.5
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nor_do_they_hide_a_clock_that_is_far_off(seed: int) -> None:
+    offset, *_ = tune(session_of("a", WORLD), wandering_gnss(seed, tuple(ANTENNA)), late_s=0.5)
+    assert offset == pytest.approx(0.5, abs=0.1)
 
 
 def test_few_fixes_tell_nothing() -> None:
