@@ -23,8 +23,12 @@ from scanloom.stages.fusion.walk import Walk, random_walk
 from scanloom.stages.geometry.geodesy import geodetic_to_world
 from scanloom.stages.geometry.se3 import F8
 
-__all__ = ["Fixes", "GnssSettings", "judge", "middle", "positions", "refusals", "screen"]
+__all__ = ["Fixes", "GnssSettings", "contradictions", "judge", "middle", "positions", "refusals", "screen"]
 
+DISAGREES = "disagrees with the motion odometry saw"
+HEIGHT_JUMPS = "height jumps against odometry's"
+FEW = 0.02
+"""Share of fixes that contradict the motion without a word to the user."""
 WHOLE_DRIFT = 0.04
 """Of odometry over a whole session, m per m: how far a fix may lie from the session laid on GNSS as a rigid whole."""
 LEAST_WAY_M = 10.0
@@ -86,16 +90,15 @@ def positions(gnss: Gnss, origin: Georeference) -> F8:
 def middle(gnss: Gnss) -> Georeference:
     """A frame in the midst of the fixes, wherever some of them may lie; without a projection."""
     there = plausible(gnss)
+
+    def mid(values: F8) -> float:
+        """One of the values, so that longitudes on both sides of 180 deg have no mean."""
+        return float(np.sort(values[there])[there.sum() // 2]) if there.any() else 0.0
+
     return Georeference(
-        epsg=0,
-        latitude_deg=float(np.median(gnss.latitude_deg[there])) if there.any() else 0.0,
-        longitude_deg=float(np.median(gnss.longitude_deg[there])) if there.any() else 0.0,
-        height_m=float(np.median(gnss.height_m[there])) if there.any() else 0.0,
-        easting_m=0,
-        northing_m=0,
-        grid_convergence_rad=0,
-        point_scale=1,
-    )
+        epsg=0, latitude_deg=mid(gnss.latitude_deg), longitude_deg=mid(gnss.longitude_deg), height_m=mid(gnss.height_m),
+        easting_m=0, northing_m=0, grid_convergence_rad=0, point_scale=1,
+    )  # fmt: skip
 
 
 def refusals(drives: Sequence[Drive], fixes: Sequence[Fixes]) -> list[str]:
@@ -109,6 +112,21 @@ def refusals(drives: Sequence[Drive], fixes: Sequence[Fixes]) -> list[str]:
             reason = str(reasons[int(np.argmax(count))]) or f.remark
             out[d.name] = f"{d.name}: GNSS is not used: {reason}{local}"
     return list(out.values())
+
+
+def contradictions(drives: Sequence[Drive], fixes: Sequence[Fixes]) -> list[str]:
+    """Of every session of which more than a few fixes contradict the motion: how many."""
+    said, counted = [], dict.fromkeys((d.name for d in drives), (0, 0))
+    for d, f in zip(drives, fixes, strict=True):
+        wrong = sum(str(v) in (DISAGREES, HEIGHT_JUMPS) for v in f.verdict)
+        counted[d.name] = (counted[d.name][0] + wrong, counted[d.name][1] + len(f.verdict))
+    for name, (wrong, every) in counted.items():
+        if wrong > FEW * every:
+            share = 100.0 * wrong / every
+            said.append(
+                f"{name}: {wrong} of {every} GNSS fixes ({share:.0f} %) contradict the motion and are left out"
+            )
+    return said
 
 
 def antenna_level(drive: Drive, R_level_odom: F8) -> F8:
@@ -138,12 +156,12 @@ def _against_motion(settings: GnssSettings, gnss: Gnss, verdict: Texts, level: F
         if np.isfinite(swapped).all() and _share_of_way(driven, agree(swapped)) >= enough:
             return "latitude and longitude are swapped"
         return f"fixes contradict the motion of the vehicle on {100 * (1 - share):.0f} % of its way; none is used"
-    mark(verdict, np.isin(np.arange(len(verdict)), passed[~keep]), "disagrees with the motion odometry saw")
+    mark(verdict, np.isin(np.arange(len(verdict)), passed[~keep]), DISAGREES)
     up = (world - level)[passed[keep], 2] + 0j
     steady = longest_chain(
         up, driven[keep], sigma[keep, 2], settings.height_tolerance_m, settings.height_drift, settings.chain_m
     )
-    mark(verdict, np.isin(np.arange(len(verdict)), passed[keep][~steady]), "height jumps against odometry's")
+    mark(verdict, np.isin(np.arange(len(verdict)), passed[keep][~steady]), HEIGHT_JUMPS)
     return ""
 
 

@@ -27,7 +27,7 @@ from scanloom.stages.fusion.bridging import bridges, guessed
 from scanloom.stages.fusion.drives import Drive, gather
 from scanloom.stages.fusion.extending import final, held, on_base, on_ties
 from scanloom.stages.fusion.factors import graph_table, position_residuals, whitened_norms
-from scanloom.stages.fusion.gnss import refusals
+from scanloom.stages.fusion.gnss import contradictions, refusals
 from scanloom.stages.fusion.gravity import gravity
 from scanloom.stages.fusion.links import links
 from scanloom.stages.fusion.placing import place_by_gnss, placed
@@ -101,7 +101,7 @@ def _fused(
     after = whitened_norms(factors, solution.T)
     residual_m = position_residuals(factors, solution.T)
     table = graph_table(factors, before, after, residual_m, _key(drives))
-    yield dataclasses.replace(table, remarks=told, warnings=warnings)
+    yield dataclasses.replace(table, remarks=[*told, *contradictions(drives, fixes)], warnings=warnings)
 
 
 def _key(drives: Sequence[Drive]) -> Callable[[int], str]:

@@ -123,6 +123,27 @@ def test_part_of_the_log_is_wrong_and_the_rest_is_used(name: str, part: tuple[fl
     assert 0.01 < ate(in_truth_frame(poses), WORLD.T, align=False) < 1.5
 
 
+def test_the_share_of_contradicting_fixes_is_said() -> None:
+    rows = (np.arange(N) >= 0.3 * N) & (np.arange(N) < 0.5 * N)
+    _, graph = fuse(PARTS["moved together"](rows), odometry=ODOMETRY, world=WORLD)
+    assert any(f"{rows.sum()} of {N} GNSS fixes (20 %) contradict" in r for r in graph.remarks), graph.remarks
+    _, graph = fuse(GNSS, odometry=ODOMETRY, world=WORLD)
+    assert graph.remarks == []
+
+
+def test_a_session_across_the_date_line_is_no_worse() -> None:
+    for longitude in (180.0, -180.0):
+        origin = georeference(-17.0, longitude, 20.0)
+        geodetic = world_to_geodetic(origin, _east_north_up() - _east_north_up().mean(axis=0))
+        gnss = changed(geodetic[:, 0].copy(), geodetic[:, 1].copy())
+        assert gnss.longitude_deg.min() < -179.9
+        assert gnss.longitude_deg.max() > 179.9
+        poses, graph = fuse(gnss, odometry=ODOMETRY, world=WORLD)
+        assert poses.frame == "world"
+        assert (graph.verdict[graph.kind == "gnss"] == "used").sum() > 40
+        assert 0.01 < ate(poses.T_world_lidar, WORLD.T) < 1.5, "the antenna is told to be elsewhere"
+
+
 def test_a_height_that_jumps_is_named() -> None:
     height = GNSS.height_m.copy()
     height[200:204] += 8.0
