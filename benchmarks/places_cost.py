@@ -11,7 +11,7 @@ from benchmarks.places_worlds import World
 from benchmarks.scores import Figure
 from scanloom.schemas.scans import DeskewedScan, ScanLabels
 from scanloom.stages.loops.places import FIRST_LEFT_OUT, Settings, describe
-from scanloom.stages.loops.scan_context import scan_context
+from scanloom.stages.loops.scan_context import scan_contexts
 
 SCANS = 40
 
@@ -25,7 +25,9 @@ def figures(w: World) -> Iterator[Figure]:
 
     def alone(scan: DeskewedScan, label: ScanLabels) -> None:
         drawn = label.class_ < FIRST_LEFT_OUT
-        scan_context(scan.x_m, scan.y_m, scan.z_m, drawn, settings.max_radius_m, settings.height_offset_m)
+        scan_contexts(
+            scan.x_m, scan.y_m, scan.z_m, drawn, settings.max_radius_m, settings.height_offset_m, (0.0,)
+        )
 
     def everything(scan: DeskewedScan, label: ScanLabels) -> None:
         describe(settings, scan, label)

@@ -19,7 +19,7 @@ from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.geometry.lookahead import ahead
 from scanloom.stages.loops.range_image import ImageSettings, range_image
 from scanloom.stages.loops.reading import keyframe_scans
-from scanloom.stages.loops.scan_context import F4, RINGS, SECTORS, scan_context
+from scanloom.stages.loops.scan_context import F4, RINGS, SECTORS, scan_contexts
 from scanloom.stages.loops.segmentation import SegmentationSettings, segments
 
 VERSION = 2
@@ -101,8 +101,7 @@ def describe(settings: Settings, scan: DeskewedScan, label: ScanLabels) -> Descr
 def _around(settings: Settings, x: F4, y: F4, z: F4, drawn: NDArray[np.bool_]) -> F4:
     """Scan contexts (3, 20, 60) from the LiDAR, from its left and from its right."""
     lanes = (0.0, settings.lane_m, -settings.lane_m)
-    radius, offset = settings.max_radius_m, settings.height_offset_m
-    return np.stack([scan_context(x, y, z, drawn, radius, offset, lane) for lane in lanes])
+    return scan_contexts(x, y, z, drawn, settings.max_radius_m, settings.height_offset_m, lanes)
 
 
 def _upright(scan: DeskewedScan, label: ScanLabels) -> tuple[F4, F4]:

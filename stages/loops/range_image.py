@@ -18,11 +18,12 @@ from scanloom.stages.geometry.voxels import Int
 
 F4 = NDArray[np.float32]
 B1 = NDArray[np.bool_]
+I2 = NDArray[np.int16]
 I4 = NDArray[np.int32]
 I8 = NDArray[np.int64]
 
-BIN_RAD = np.radians(0.05)
 BINS = 3600
+BIN_RAD = np.pi / BINS
 """Of elevation, from straight down to straight up."""
 BESIDE_BINS = 15
 """0.75 deg: a bin belongs to a beam when it holds a tenth of the fullest bin that near."""
@@ -37,7 +38,12 @@ STRAY_SHARE = 0.1
 """Runs of bins with less than this share of the points of the usual run are no beams."""
 FILLED_SHARE = 0.97
 """Columns over the points of the fullest row, so that the jitter of azimuths leaves no column empty."""
+LEAST_COLUMNS = 36
 TAU = 2 * np.pi
+
+ATAN = tuple(np.float32(c / TAU) for c in (0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.0208351))
+ZERO, QUARTER, HALF, WHOLE, TINY = (np.float32(c) for c in (0.0, 0.25, 0.5, 1.0, 1e-30))
+BINS_PER_TURN = np.float32(2 * BINS)
 
 
 class ImageSettings(BaseModel):
@@ -71,41 +77,51 @@ class RangeImage:
 
 
 def range_image(settings: ImageSettings, x_m: F4, y_m: F4, z_m: F4, seen: B1, drawn: B1) -> RangeImage:
-    """The image of the points `drawn` (n,); its rows and columns are laid out by all points `seen` (n,).
+    """The image of those of the points `seen` (n,) that are `drawn` (n,); its rows and columns are laid out by all seen.
 
     Points without finite coordinates, or in the origin, are in neither.
     """
-    elevation, azimuth, counts = _angles(x_m, y_m, z_m, seen)
-    edges = _row_edges(settings, elevation, counts)
-    row = np.searchsorted(edges, elevation, side="right").astype(np.int32)
-    row[np.isnan(elevation)] = -1
-    rows = len(edges) + 1
-    fullest = int(np.bincount(row[row >= 0], minlength=1).max())
-    columns = int(np.clip(FILLED_SHARE * fullest, 36, settings.columns))
-    point, ranges = np.full((rows, columns), -1, np.int32), np.zeros((rows, columns), np.float32)
-    _draw(x_m, y_m, z_m, drawn, row, azimuth, point, ranges)
-    return RangeImage(point, ranges, _row_middles(row, elevation, edges), TAU / columns)
+    elevation, counts, still = _elevations(x_m, y_m, z_m, seen)
+    first = _first_bins(settings, counts, still)
+    points = np.add.reduceat(counts, first) if counts.any() else np.zeros(1, np.int64)
+    middle = np.add.reduceat(counts * (np.arange(BINS) + 0.5), first) / np.maximum(points, 1)
+    ends = np.append(first, BINS)
+    middle = np.where(points > 0, middle, 0.5 * (ends[:-1] + ends[1:])) * BIN_RAD - np.pi / 2
+    columns = int(np.clip(FILLED_SHARE * points.max(), LEAST_COLUMNS, settings.columns))
+    row = np.repeat(np.arange(len(first), dtype=np.int32), np.diff(ends))
+    point, ranges = np.full((len(first), columns), -1, np.int32), np.zeros((len(first), columns), np.float32)
+    _draw(x_m, y_m, z_m, drawn, elevation, row, point, ranges)
+    return RangeImage(point, ranges, middle, TAU / columns)
 
 
-def _row_edges(settings: ImageSettings, elevation: F4, counts: I8) -> F8:
-    """Elevations (rows - 1,) between rows, from below; `counts` of points per bin of elevation."""
-    if np.isnan(elevation).all():
-        return np.empty(0)
-    low, high = float(np.nanmin(elevation)), float(np.nanmax(elevation))
-    first, last = _beams(counts)
-    total = np.concatenate(([0], np.cumsum(counts)))
+def _first_bins(settings: ImageSettings, counts: I8, still: I8) -> I8:
+    """First bin of elevation of each row, from below; `still` counts the points that tell beams apart."""
+    filled = np.flatnonzero(counts)
+    if not len(filled):
+        return np.zeros(1, np.int64)
+    low, high = float(filled[0]), float(filled[-1] + 1)
+    edges = _beam_edges(settings, still, low, high)
+    if edges is None:
+        edges = np.linspace(low, high, settings.rows + 1)[1:-1]
+    return np.unique(np.append(0, np.round(edges).astype(np.int64)))
+
+
+def _beam_edges(settings: ImageSettings, still: I8, low: float, high: float) -> F8 | None:
+    """Bins between beams, from `low` to `high`; None where beams cannot be told apart or are more than the rows."""
+    first, last = _beams(still)
+    total = np.concatenate(([0], np.cumsum(still)))
     points = total[last + 1] - total[first]
     real = points >= STRAY_SHARE * np.median(points) if len(points) else np.zeros(0, np.bool_)
     first, last = first[real], last[real]
-    if len(first) >= LEAST_BEAMS:
-        step = _step(0.5 * (first + last)) * BIN_RAD
-        between = 0.5 * (last[:-1] + 1 + first[1:]) * BIN_RAD - np.pi / 2
-        below = np.arange(between[0] - step, low, -step)[::-1]
-        above = np.arange(between[-1] + step, high, step)
-        narrow = np.median(last - first + 1) * BIN_RAD <= WIDEST_BEAM * step
-        if narrow and len(below) + len(between) + len(above) < settings.rows:
-            return np.concatenate((below, between, above))
-    return np.linspace(low, high + 1e-6, settings.rows + 1)[1:-1]
+    if len(first) < LEAST_BEAMS:
+        return None
+    step = _step(0.5 * (first + last))
+    between = 0.5 * (last[:-1] + 1 + first[1:])
+    below, above = np.arange(between[0] - step, low, -step)[::-1], np.arange(between[-1] + step, high, step)
+    if np.median(last - first + 1) > WIDEST_BEAM * step:
+        return None
+    edges = np.concatenate((below, between, above))
+    return edges if len(edges) < settings.rows else None
 
 
 def _step(middles: F8) -> float:
@@ -114,29 +130,21 @@ def _step(middles: F8) -> float:
     return float(np.mean(steps[steps < 1.5 * np.median(steps)]))
 
 
-def _row_middles(row: I4, elevation: F4, edges: F8) -> F8:
-    """Mean elevation of the points of each row; of an empty one, the middle between its edges."""
-    ends = np.concatenate((edges[:1], edges, edges[-1:])) if len(edges) else np.zeros(2)
-    known = row >= 0
-    count = np.bincount(row[known], minlength=len(ends) - 1)
-    total = np.bincount(row[known], weights=elevation[known], minlength=len(ends) - 1)
-    return np.asarray(np.where(count > 0, total / np.maximum(count, 1), 0.5 * (ends[:-1] + ends[1:])))
-
-
 @kernel
-def _angles(x: F4, y: F4, z: F4, seen: B1) -> tuple[F4, F4, I8]:
-    """Elevation and azimuth (n,), rad, NaN for points that are not seen; points that tell beams apart per bin of elevation."""
-    elevation, azimuth = np.full(len(x), np.nan, np.float32), np.full(len(x), np.nan, np.float32)
-    counts = np.zeros(BINS, np.int64)
+def _elevations(x: F4, y: F4, z: F4, seen: B1) -> tuple[I2, I8, I8]:
+    """Bin of elevation (n,), -1 for points that are not seen; points per bin, and those that tell beams apart per bin."""
+    out = np.full(len(x), -1, np.int16)
+    counts, still = np.zeros(BINS, np.int64), np.zeros(BINS, np.int64)
     for n in range(len(x)):
-        flat = np.sqrt(x[n] * x[n] + y[n] * y[n])
-        if not seen[n] or not 0.0 < flat + abs(z[n]) < np.inf:
+        square = x[n] * x[n] + y[n] * y[n]
+        if not seen[n] or not 0.0 < square + abs(z[n]) < np.inf:
             continue
-        elevation[n] = np.arctan2(z[n], flat)
-        azimuth[n] = np.arctan2(y[n], x[n])
-        if abs(z[n]) < STILL_PER_M * flat * flat:
-            counts[min(max(int((elevation[n] + np.pi / 2) / BIN_RAD), 0), BINS - 1)] += 1
-    return elevation, azimuth, counts
+        up = turn_of(np.sqrt(square), z[n])
+        k = min(int((up + QUARTER if up < HALF else up - HALF - QUARTER) * BINS_PER_TURN), BINS - 1)
+        out[n] = k
+        counts[k] += 1
+        still[k] += abs(z[n]) < STILL_PER_M * square
+    return out, counts, still
 
 
 @kernel
@@ -159,13 +167,30 @@ def _beams(counts: I8) -> tuple[I8, I8]:
 
 
 @kernel
-def _draw(x: F4, y: F4, z: F4, drawn: B1, row: I4, azimuth: F4, point: I4, ranges: F4) -> None:
+def _draw(x: F4, y: F4, z: F4, drawn: B1, elevation: I2, row: I4, point: I4, ranges: F4) -> None:
     columns = point.shape[1]
     for n in range(len(x)):
-        if not drawn[n] or row[n] < 0:
+        if not drawn[n] or elevation[n] < 0:
             continue
-        column = int((azimuth[n] / TAU + 0.5) * columns) % columns
+        v = row[elevation[n]]
+        u = min(int(turn_of(x[n], y[n]) * np.float32(columns)), columns - 1)
         r = np.sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n])
-        if point[row[n], column] < 0 or r < ranges[row[n], column]:
-            point[row[n], column] = n
-            ranges[row[n], column] = r
+        if point[v, u] < 0 or r < ranges[v, u]:
+            point[v, u], ranges[v, u] = n, r
+
+
+@kernel
+def turn_of(x: float, y: float) -> float:
+    """Direction of (x, y) in [0, 1] turns from x towards y, to 2e-6, in single precision: a third of arctan2's time.
+
+    Abramowitz and Stegun 4.4.47.
+    """
+    a, b = abs(x), abs(y)
+    big, small = (a, b) if a > b else (b, a)
+    t = small / (big if big > TINY else TINY)
+    s = t * t
+    turn = t * (ATAN[0] + s * (ATAN[1] + s * (ATAN[2] + s * (ATAN[3] + s * ATAN[4]))))
+    turn = QUARTER - turn if b > a else turn
+    turn = HALF - turn if x < ZERO else turn
+    turn = WHOLE - turn if y < ZERO else turn
+    return turn  # type: ignore[return-value]  # float() would widen it

@@ -5,6 +5,7 @@ Scan Context (Kim and Kim, IROS 2018; methods 2.4), written from its formulae: t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.voxels import Int
+from scanloom.stages.loops.range_image import turn_of
 
 F4 = NDArray[np.float32]
 I2 = NDArray[np.int16]
@@ -27,18 +29,25 @@ STEPS_PER_M = 64.0
 TAU = 2 * np.pi
 
 
-def scan_context(
-    x_m: F4, y_m: F4, z_m: F4, drawn: B1, max_radius_m: float, height_offset_m: float, left_m: float = 0.0
+def scan_contexts(
+    x_m: F4,
+    y_m: F4,
+    z_m: F4,
+    drawn: B1,
+    max_radius_m: float,
+    height_offset_m: float,
+    lanes_m: Sequence[float],
 ) -> F4:
-    """Highest point (20, 60), m above the offset, per ring of max_radius/20 and sector of 6 degrees; empty bins are 0.
+    """Highest point (lanes, 20, 60), m above the offset, per ring of max_radius/20 and sector of 6 degrees; 0 where none is.
 
     Parameters
     ----------
     drawn : (n,) points that count; those without finite coordinates never do.
-    left_m : how far to the left of the LiDAR the middle of the rings is, m.
+    lanes_m : how far to the left of the LiDAR the middle of the rings is, m.
     """
-    out = np.zeros((RINGS, SECTORS), np.float32)
-    _highest(x_m, y_m, z_m, drawn, float(max_radius_m), float(height_offset_m), float(left_m), out)
+    out = np.zeros((len(lanes_m), RINGS, SECTORS), np.float32)
+    radius_offset, left = np.array([max_radius_m, height_offset_m], np.float32), np.array(lanes_m, np.float32)
+    _highest(x_m, y_m, z_m, drawn, radius_offset, left, out)
     return np.asarray(np.round(out * np.float32(STEPS_PER_M)) / np.float32(STEPS_PER_M))
 
 
@@ -143,19 +152,17 @@ def distance_around(column_i: I2, column_j: I2, middle: Int, beside: int) -> tup
 
 
 @kernel
-def _highest(
-    x: F4, y: F4, z: F4, drawn: B1, radius: float, offset: float, left: float, out: F4
-) -> None:  # fmt: skip
-    rings, sectors = out.shape
+def _highest(x: F4, y: F4, z: F4, drawn: B1, radius_offset: F4, left: F4, out: F4) -> None:
+    lanes, rings, sectors = out.shape
+    radius, offset = radius_offset[0], radius_offset[1]
     for k in range(len(x)):
         if not drawn[k]:
             continue
-        u, v = float(x[k]), float(y[k]) - left
-        r = np.sqrt(u * u + v * v)
-        if not r < radius:
-            continue
-        height = z[k] + offset
-        ring = min(int(r / radius * rings), rings - 1)
-        sector = int(np.floor((np.arctan2(v, u) / TAU + 1.0) * sectors)) % sectors
-        if height > out[ring, sector]:
-            out[ring, sector] = height
+        for lane in range(lanes):
+            u, v = x[k], y[k] - left[lane]
+            r = np.sqrt(u * u + v * v)
+            if r < radius:
+                ring = min(int(r / radius * np.float32(rings)), rings - 1)
+                sector = min(int(turn_of(u, v) * np.float32(sectors)), sectors - 1)
+                if z[k] + offset > out[lane, ring, sector]:
+                    out[lane, ring, sector] = z[k] + offset

@@ -154,11 +154,17 @@ def _together(r1: float, r2: float, sine: float, cosine: float, difference: floa
 
 
 @kernel
-def _neighbour(point: I4, row: Int, column: Int, up: int, right: int, gap: int) -> tuple[Int, Int, Int]:
+def _neighbour(point: I4, row: Int, column: Int, up: Int, right: Int, gap: Int) -> tuple[Int, Int, Int]:
     """The next filled cell in a direction and its distance in cells, at most `gap` + 1; distance 0 when there is none."""
     rows, columns = point.shape
+    v, u = row, column
     for k in range(1, gap + 2):
-        v, u = row + k * up, (column + k * right) % columns
+        v += up
+        u += right
+        if u < 0:
+            u += columns
+        elif u >= columns:
+            u -= columns
         if v < 0 or v >= rows:
             return 0, 0, 0
         if point[v, u] >= 0:
@@ -195,7 +201,7 @@ def _label(
                 row_of[v] = found
                 sizes[found - 1, 1] += 1
             for side in range(4):
-                up, right = (1 - side if side % 2 == 0 else 0), (2 - side if side % 2 == 1 else 0)
+                up, right = (1 - side, 0) if side % 2 == 0 else (0, 2 - side)
                 w, t, cells = _neighbour(point, v, u, up, right, gap)
                 if cells == 0 or label[w, t] > 0:
                     continue
