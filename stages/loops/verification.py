@@ -77,7 +77,7 @@ class VerificationSettings(MatchingSettings):
         default=0.2, ge=0, le=1, description="a copy displaced by 1.5 m must lose this share of inliers"
     )
     max_rival: float = Field(
-        default=0.85, ge=0, le=1, description="fit of the second-best pose over that of the best, at most"
+        default=0.7, ge=0, le=1, description="fit of the second-best pose over that of the best, at most"
     )
     max_unevenness: float = Field(
         default=2.3,
