@@ -14,14 +14,13 @@ import argparse
 import json
 import time
 from collections.abc import Iterator, Sequence
-from importlib import import_module, util
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import places_cost, places_loops, places_search
+from benchmarks import loop_levels, places_cost, places_loops, places_search
 from benchmarks.places_worlds import KINDS, SEEDS, World, given, simulated, world
 from benchmarks.scores import Figure
 from scanloom.schemas.errors import ScanloomError
@@ -35,14 +34,17 @@ def main(words: Sequence[str] | None = None) -> None:
     options = _options(words)
     started = time.monotonic()
     figures: list[Figure] = []
+    everything: list[World] = []
     for kind in options.worlds:
         with console.status(f"{kind}"):
             worlds = [world(drive, options.store) for drive in simulated(kind, options.seeds)]
         figures += _of(kind, worlds)
+        everything += worlds
     for folder in options.data:
         figures += _of_log(folder, options.store)
-    if options.levels and options.worlds:
-        figures += _levels()
+    if options.levels and everything:
+        with console.status("matching at levels 1 to 5"):
+            figures += loop_levels.figures(everything)
     figures.append(
         Figure("bench.run.wall_s", time.monotonic() - started, "s", "run", "wall time of this benchmark")
     )
@@ -81,13 +83,6 @@ def _of_log(folder: Path, store: Path) -> Iterator[Figure]:
         console.print(f"[yellow]{folder}: {error}; going on without.[/]")
         return
     yield from _of(found.name, [found])
-
-
-def _levels() -> Iterator[Figure]:
-    if util.find_spec("benchmarks.loop_levels") is None:
-        console.print("[yellow]no benchmark of the levels of matching here; going on without.[/]")
-        return
-    yield from import_module("benchmarks.loop_levels").figures()
 
 
 def _show(options: argparse.Namespace, figures: Sequence[Figure]) -> None:
