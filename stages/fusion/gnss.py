@@ -18,7 +18,16 @@ from scanloom.stages.fusion.agreement import C16, agreeing, longest_chain
 from scanloom.stages.fusion.alignment import Alignment, align_level
 from scanloom.stages.fusion.drives import Drive
 from scanloom.stages.fusion.gnss_settings import GnssSettings
-from scanloom.stages.fusion.receiver import Flags, Texts, mark, plausible, receiver_sigma, screen
+from scanloom.stages.fusion.receiver import (
+    RECOVERING,
+    Flags,
+    Texts,
+    mark,
+    plausible,
+    receiver_sigma,
+    screen,
+    since_outage_s,
+)
 from scanloom.stages.fusion.walk import Walk, random_walk
 from scanloom.stages.geometry.geodesy import geodetic_to_world
 from scanloom.stages.geometry.se3 import F8
@@ -57,7 +66,7 @@ def judge(
 ) -> Fixes:
     """Remaining gates: agreement with odometry, heading, spacing. `verdict` comes from `screen`."""
     verdict = verdict.copy()
-    world, sigma = positions(drive.gnss, origin), _weights(settings, drive.gnss)
+    world, sigma = positions(drive.gnss, origin), _weights(settings, drive.gnss, verdict)
     passed = np.flatnonzero(verdict == "")
     level, way = antenna_level(drive, R_level_odom), drive.travelled_at(drive.gnss.stamp_ns)
     remark = ""
@@ -181,8 +190,13 @@ def _plane(points: F8) -> C16:
     return np.asarray(points[:, 0] + 1j * points[:, 1])
 
 
-def _weights(settings: GnssSettings, gnss: Gnss) -> F8:
+def _weights(settings: GnssSettings, gnss: Gnss, verdict: Texts) -> F8:
+    """Standard deviations (n, 3) after floors, inflation and what a receiver is off by when it has just come back."""
     sigma = np.maximum(receiver_sigma(settings, gnss), settings.min_sigma_m) * settings.inflation
+    good = (verdict == "") | (verdict == RECOVERING)
+    since = since_outage_s(gnss.stamp_ns, good, settings.outage_s)
+    fading = settings.recovery_sigma_m * np.exp(-since / max(settings.recovery_s, 1e-3))
+    sigma = np.hypot(sigma, fading[:, None])
     sigma[:, 2] = np.maximum(sigma[:, 2], 2.0 * sigma[:, :2].max(axis=1, initial=0.0))
     return np.asarray(sigma)
 

@@ -37,6 +37,12 @@ class GnssSettings(BaseModel):
     recovery_s: float = Field(
         default=5.0, ge=0, le=600, description="good fixes needed after an outage before one is used, s"
     )
+    recovery_sigma_m: float = Field(
+        default=2.0,
+        ge=0,
+        le=100,
+        description="standard deviation to add right after an outage, fading with recovery_s as its time constant, m",
+    )
     max_clock_offset_s: float = Field(
         default=20.0,
         ge=0,

@@ -14,6 +14,7 @@ from scanloom.stages.geometry.se3 import F8
 Texts = NDArray[np.object_]
 Flags = NDArray[np.bool_]
 
+RECOVERING = "recovering after an outage"
 NOWHERE_DEG = 1e-6
 UTM_DEG = (-80.0, 84.0)
 FROZEN_M = 3.0
@@ -38,8 +39,8 @@ def screened(settings: GnssSettings, drive: Drive) -> Texts:
     too_wide = receiver_sigma(settings, gnss)[:, :2].max(axis=1, initial=0.0) > settings.max_sigma_m
     mark(verdict, too_wide, "receiver's standard deviation too large")
     mark(verdict, _frozen(drive, verdict == ""), "position stands still while the vehicle drives")
-    late = _recovering(gnss.stamp_ns, verdict == "", settings.outage_s, settings.recovery_s)
-    mark(verdict, late, "recovering after an outage")
+    late = since_outage_s(gnss.stamp_ns, verdict == "", settings.outage_s) < settings.recovery_s
+    mark(verdict, late, RECOVERING)
     return verdict
 
 
@@ -98,14 +99,13 @@ def _frozen(drive: Drive, good: Flags) -> Flags:
     return out
 
 
-def _recovering(stamp_ns: I8, good: Flags, outage_s: float, recovery_s: float) -> Flags:
-    """Good fixes that come less than `recovery_s` after a pause of `outage_s` without any."""
-    out = np.zeros(len(stamp_ns), bool)
-    last_good, recovered_at = None, None
-    for k in np.flatnonzero(good):
-        now = int(stamp_ns[k])
-        if last_good is not None and now - last_good > outage_s * 1e9:
-            recovered_at = now
-        out[k] = recovered_at is not None and now - recovered_at < recovery_s * 1e9
-        last_good = now
+def since_outage_s(stamp_ns: I8, good: Flags, outage_s: float) -> F8:
+    """Seconds (n,) from the first good fix after the last pause of `outage_s` without any; infinite before a pause."""
+    rows = np.flatnonzero(good)
+    out = np.full(len(stamp_ns), np.inf)
+    again = rows[1:][np.diff(stamp_ns[rows]) > outage_s * 1e9]
+    if len(again):
+        last = np.searchsorted(again, np.arange(len(stamp_ns)), side="right") - 1
+        known = last >= 0
+        out[known] = (stamp_ns[known] - stamp_ns[again[last[known]]]) * 1e-9
     return out

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from scanloom.schemas.tracks import Gnss
+from scanloom.stages.fusion.gnss import judge, middle
 from scanloom.stages.fusion.gnss_settings import GnssSettings
-from scanloom.stages.fusion.receiver import plausible, screen
-from tests.stages.fusion.drives import gnss_of, rectangle, session_of
+from scanloom.stages.fusion.receiver import plausible, screen, since_outage_s
+from tests.stages.fusion.drives import gnss_of, odometry_of, rectangle, session_of
 from tests.stages.fusion.test_fusion import ODOMETRY, WORLD
 from tests.stages.fusion.test_tuning import drives_of
 
@@ -96,8 +97,6 @@ def test_at_a_crawl_a_repeated_position_is_none() -> None:
     """0.15 m a fix: a run of twenty is 3 m long, one more is beyond it."""
     slow = rectangle(laps=0.2, speed=0.75)
     gnss = gnss_of(slow, every=2)
-    from tests.stages.fusion.drives import odometry_of
-
     track = odometry_of(slow, sigma_t=1e-6)
     for count, stuck in ((19, False), (22, True)):
         held = {k: getattr(gnss, k).copy() for k in ("latitude_deg", "longitude_deg")}
@@ -114,3 +113,26 @@ def test_recovery_after_what_was_no_position() -> None:
     verdict = verdicts(dataclasses.replace(GNSS, latitude_deg=latitude), recovery_s=3.0)
     assert set(verdict[K + 10 : K + 16]) == {"recovering after an outage"}
     assert verdict[K + 16] == ""
+
+
+def test_time_since_an_outage() -> None:
+    stamp_ns = (np.array([0.0, 1.0, 3.0, 3.5, 6.6, 7.0, 9.1]) * 1e9).astype(np.int64)
+    good = np.array([1, 1, 1, 0, 1, 1, 1], bool)
+    found = since_outage_s(stamp_ns, good, 2.0)
+    np.testing.assert_allclose(found, [np.inf, np.inf, np.inf, np.inf, 0.0, 0.4, 0.0], atol=1e-9)
+    assert np.isinf(since_outage_s(stamp_ns, good, 10.0)).all()
+    assert np.isinf(since_outage_s(stamp_ns, np.zeros(7, bool), 2.0)).all()
+
+
+def test_fixes_after_an_outage_weigh_less_for_a_while() -> None:
+    status = GNSS.status.copy()
+    status[K : K + 10] = -1
+    gnss = dataclasses.replace(GNSS, status=status)
+    drive = drives_of(session_of("a", WORLD), gnss, ODOMETRY)[0]
+    settings = GnssSettings(recovery_s=5.0, recovery_sigma_m=2.0)
+    sigma = judge(settings, drive, screen(settings, drive), middle(gnss), np.eye(3)).sigma_m
+    usual = sigma[0]
+    np.testing.assert_allclose(usual, [0.2, 0.2, 0.4], rtol=1e-6)
+    np.testing.assert_allclose(sigma[K + 20, 0], np.hypot(0.2, 2.0 * np.exp(-1.0)), rtol=1e-3)
+    np.testing.assert_allclose(sigma[-1], usual, rtol=0.02)
+    assert (sigma[:K] == usual).all()
