@@ -35,7 +35,7 @@ from scanloom.stages.fusion.settings import Settings
 from scanloom.stages.fusion.solving import marginals, solve
 from scanloom.stages.fusion.spreading import poses_of
 from scanloom.stages.fusion.tuning import tuned
-from scanloom.stages.fusion.untied import Untied, left_out, loops_among, those_tied
+from scanloom.stages.fusion.untied import ONE_LOOP, Untied, hanging_on_one, left_out, loops_among, those_tied
 
 __all__ = ["VERSION", "Settings", "fusion"]
 
@@ -86,12 +86,19 @@ def _fused(
     origin, fixes = place_by_gnss(settings, drives, ups, old)
     found = links(drives, loops)
     anchored, fixed = on_base(drives, old)
-    starts = anchor(anchored, placed(drives, ups, fixes, fixed), found, gaps, anywhere=bool(origin or old))
+    known = placed(drives, ups, fixes, fixed)
+    starts = anchor(anchored, known, found, gaps, anywhere=bool(origin or old))
     nodes = np.concatenate([starts[k] @ d.odometry.T_odom_lidar[d.keyframes] for k, d in enumerate(anchored)])
     factors = assembled(settings, drives, ups, fixes, found, gaps, odometers, nodes)
     factors = held(settings, factors, drives, old)
     before = whitened_norms(factors, nodes)
-    solution = solve(nodes, factors, settings.inlier_probability)
+    try:
+        solution = solve(nodes, factors, settings.inlier_probability)
+    except StageError as error:
+        lone = hanging_on_one(drives, found, known)
+        if not lone:
+            raise
+        raise Untied.of(lone, anywhere=bool(origin or old), loops=ONE_LOOP) from error
     covariance = marginals(solution)
     for name, segments in groupby(drives, key=lambda d: d.name):
         solved = Poses.concatenate([poses_of(d, solution, covariance, origin) for d in segments])

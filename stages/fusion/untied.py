@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from scanloom.stages.fusion.drives import Drive
 from scanloom.stages.fusion.links import Link
 
 LEFT_OUT = "is left out"
+ONE_LOOP = "only one loop to them was found, which nothing confirms"
 
 
 class Untied(StageError):
@@ -33,16 +35,30 @@ class Untied(StageError):
         """Whether the others have a place by GNSS or by the map that is extended, not only by being first."""
 
     @classmethod
-    def of(cls, names: Sequence[str], *, anywhere: bool) -> Untied:
+    def of(
+        cls, names: Sequence[str], *, anywhere: bool, loops: str = "no loop to them was accepted"
+    ) -> Untied:
         """The error that names these sessions."""
         named = list(dict.fromkeys(names))
         return cls(
-            "nothing ties this session to the others: it has no usable GNSS and no loop to them was accepted",
+            f"nothing ties this session to the others: it has no usable GNSS and {loops}",
             where=f"session {', '.join(named)}",
             next_step="map it on its own, or add a session that overlaps both",
             names=named,
             anywhere=anywhere,
         )
+
+
+def hanging_on_one(drives: Sequence[Drive], found: Sequence[Link], placed: Collection[int]) -> list[str]:
+    """Sessions without a place that a single loop ties to the others: nothing can confirm it."""
+    has_place = {drives[k].name for k in placed}
+    ends = Counter(
+        name
+        for link in found
+        for name in {drives[link.drive_i].name, drives[link.drive_j].name}
+        if drives[link.drive_i].name != drives[link.drive_j].name
+    )
+    return [name for name, count in sorted(ends.items()) if count == 1 and name not in has_place]
 
 
 def those_tied(
@@ -81,7 +97,7 @@ def left_out(before: Sequence[Drive], after: Sequence[Drive]) -> list[str]:
     names = dict.fromkeys(d.name for d in before)
     kept = {d.name for d in after}
     return [
-        f"session {name} {LEFT_OUT}: it has no usable GNSS, and no loop ties it to the others; map it on its own, or add a "
+        f"session {name} {LEFT_OUT}: it has no usable GNSS, and no loop that can be confirmed ties it to the others; map it on its own, or add a "
         "session that overlaps both"
         for name in names
         if name not in kept
