@@ -111,9 +111,10 @@ def _table(
     """The points of objects, object by object."""
     order = np.argsort(number, kind="stable")
     order = order[number[order] >= 0]
+    first = poses[0] if len(poses) else None
     x, y, z, through, confirming = (np.ascontiguousarray(column) for column in rows[order].T)
     return Changes(
         x_m=x, y_m=y, z_m=z, through=through.astype(np.int32), confirming=confirming.astype(np.int32),
         object_=number[order], remnants=remnants, sessions=sessions,
-        frame=poses[0].frame if len(poses) else "", georeference=poses[0].georeference if len(poses) else None,
+        frame="" if first is None else first.frame, georeference=None if first is None else first.georeference,
     )  # fmt: skip
