@@ -49,10 +49,11 @@ class PositionSettings(BaseModel):
 def accumulated(odometry: Odometry) -> F8:
     """Covariance (n, 6, 6) of all motions up to each scan, as twists about the origin of `odom`.
 
-    sum of Ad(T_k) C_k Ad(T_k)^T: the difference of two is that of the motion in between, for any two scans.
+    sum of Ad(T_k) C_k Ad(T_k)^T: the difference of two is that of the motion in between, for any two scans of a segment.
     """
     A = adjoint(odometry.T_odom_lidar)
-    return np.cumsum(A @ odometry.covariance @ np.swapaxes(A, 1, 2), axis=0)
+    told = np.diff(odometry.segment, prepend=-1) == 0  # what lies between segments would drown all else
+    return np.cumsum(A @ (odometry.covariance * told[:, None, None]) @ np.swapaxes(A, 1, 2), axis=0)
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,13 @@ class Whereabouts:
             out,
         )
         return out.reshape(i.shape)
+
+    def spread_m(self, i: int, j: int) -> tuple[float, float]:
+        """Standard deviations of where j is seen from i, m: the larger horizontal one, and the vertical one."""
+        first, last = min(i, j), max(i, j)
+        W = np.ascontiguousarray(self.spread[last] - self.spread[first])
+        level, up = _variances(W, np.ascontiguousarray(self.position_m[last]))
+        return float(np.sqrt(level)), float(np.sqrt(up))
 
     def _arrays(self) -> tuple[F8, F8, F8]:
         return tuple(np.ascontiguousarray(a) for a in (self.position_m, self.spread, self.travelled_m))  # type: ignore[return-value]

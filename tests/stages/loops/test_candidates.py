@@ -112,3 +112,14 @@ def test_only_places_left_long_ago_are_admitted(path_m: float, time_s: float, ad
 
 def test_one_search_per_stretch() -> None:
     assert queries_of(np.array([0.0, 0.9, 1.8, 2.1, 3.9, 8.0]), 2.0).tolist() == [0, 3, 5]
+
+
+def test_what_is_unknown_between_segments_leaves_the_rest_exact() -> None:
+    odometry = straight(200)
+    odometry.covariance[:] = np.eye(6) * 1e-6
+    whole = accumulated(odometry)
+    odometry.segment[120:] = 1
+    odometry.covariance[120] = np.eye(6) * 1e12
+    split = accumulated(odometry)
+    for i, j in ((10, 110), (130, 190)):
+        np.testing.assert_allclose(split[j] - split[i], whole[j] - whole[i], rtol=1e-6, atol=1e-12)
