@@ -27,6 +27,8 @@ TURN_RAD, TURN_RAD_M = np.radians(6.0), np.radians(0.05)
 """Most that the heading of odometry drifts: always, and per metre."""
 BETTER = 3.0
 """How much less than the receiver states its fixes may be taken to scatter."""
+MOST_SLACK = 0.2
+"""Share of a chord that odometry may be off by and still tell its direction."""
 SIGMAS = 3.5
 """Chance lies beyond once in 450 times, in the plane."""
 MOST_COMPARED = 2000
@@ -37,7 +39,7 @@ ROUNDS = 3
 
 
 def agreeing(
-    p: C16, q: C16, way_m: F8, sigma_m: F8, tolerance_m: float, drift: float, farthest_m: float
+    p: C16, q: C16, way_m: F8, slack_m: F8, sigma_m: F8, tolerance_m: float, farthest_m: float
 ) -> Flags:
     """Fixes (n,) of the longest chain that odometry confirms.
 
@@ -45,28 +47,30 @@ def agreeing(
     ----------
     p, q : (n,) antenna by odometry (levelled) and by GNSS, m.
     way_m : (n,) way driven at each fix, increasing.
+    slack_m : (n,) disagreement allowed up to each fix, increasing: the drift of odometry over its way, and where no scan
+        saw the motion as much as the vehicle may have moved.
     sigma_m : (n,) standard deviation the receiver states, m; less is assumed when the fixes scatter less.
-    tolerance_m, drift : disagreement always allowed, and per metre of way between two fixes.
+    tolerance_m : disagreement always allowed.
     farthest_m : fixes further apart than this are not compared.
     """
     keep = np.ones(len(p), bool)
     if len(p) < 3:
         return keep
     for _ in range(ROUNDS):
-        straight = straightened(p, q, way_m, sigma_m, tolerance_m, drift, keep)
+        straight = straightened(p, q, way_m, slack_m, sigma_m, tolerance_m, keep)
         if straight is None:
             return np.zeros(len(p), bool)
         residual = q - straight
         seen = _scatter(residual[keep]) if keep.sum() > 10 else np.inf
         sigma = np.clip(seen, sigma_m / BETTER, sigma_m)
-        before, keep = keep, longest_chain(residual, way_m, sigma, tolerance_m, drift, farthest_m)
+        before, keep = keep, longest_chain(residual, way_m, slack_m, sigma, tolerance_m, farthest_m)
         if np.array_equal(before, keep):
             break
     return keep
 
 
 def straightened(
-    p: C16, q: C16, way_m: F8, sigma_m: F8, tolerance_m: float, drift: float, keep: Flags
+    p: C16, q: C16, way_m: F8, slack_m: F8, sigma_m: F8, tolerance_m: float, keep: Flags
 ) -> C16 | None:
     """Odometry p (n,) turned into the axes of q, stretch by stretch; None when no two fixes tell a heading.
 
@@ -75,7 +79,7 @@ def straightened(
     """
     chord_m = float(np.clip(CHORD_SIGMAS * np.median(sigma_m), *CHORD_M))
     chord_m = min(chord_m, 0.5 * float(way_m[-1] - way_m[0]))
-    middle, turn = _chord_turns(p, q, way_m, sigma_m, tolerance_m, drift, keep, chord_m)
+    middle, turn = _chord_turns(p, q, way_m, slack_m, sigma_m, tolerance_m, keep, chord_m)
     if not len(middle):
         return None
     station = np.arange(way_m[0], way_m[-1] + STATION_M, STATION_M)
@@ -91,26 +95,22 @@ def straightened(
 
 
 def longest_chain(
-    residual: C16, way_m: F8, sigma_m: F8, tolerance_m: float, drift: float, farthest_m: float
+    residual: C16, way_m: F8, slack_m: F8, sigma_m: F8, tolerance_m: float, farthest_m: float
 ) -> Flags:
     """The longest chain of fixes (n,) between neighbours of which the residual does not jump.
 
-    It may change by a fixed tolerance, by 3.5 sigma and by the drift over the way between them. Fixes further apart than
+    It may change by a fixed tolerance, by 3.5 sigma and by the slack between them. Fixes further apart than
     `farthest_m` are not compared: there the chain goes on anew. Dynamic programming.
     """
     far = np.searchsorted(way_m, way_m - farthest_m)
     first = np.maximum(far, np.arange(len(residual)) - MOST_COMPARED)
     x, y = np.ascontiguousarray(residual.real), np.ascontiguousarray(residual.imag)
-    way, sigma = np.ascontiguousarray(way_m, np.float64), np.ascontiguousarray(sigma_m, np.float64)
-    return _chain(
-        x, y, way, sigma, far.astype(np.int64), first.astype(np.int64), float(tolerance_m), float(drift)
-    )
+    slack, sigma = np.ascontiguousarray(slack_m, np.float64), np.ascontiguousarray(sigma_m, np.float64)
+    return _chain(x, y, slack, sigma, far.astype(np.int64), first.astype(np.int64), float(tolerance_m))
 
 
 @kernel
-def _chain(
-    x: F8, y: F8, way_m: F8, sigma_m: F8, far: I8, first: I8, tolerance_m: float, drift: float
-) -> Flags:
+def _chain(x: F8, y: F8, slack_m: F8, sigma_m: F8, far: I8, first: I8, tolerance_m: float) -> Flags:
     """Fixes before `far` are not compared, those from `first` on are."""
     n = len(x)
     length, previous = np.ones(n, np.int64), np.full(n, -1, np.int64)
@@ -120,7 +120,7 @@ def _chain(
         for a in range(k - 1, first[k] - 1, -1):
             if length[a] > best:
                 sigma = np.sqrt(sigma_m[a] ** 2 + sigma_m[k] ** 2)
-                allowed = tolerance_m + SIGMAS * sigma + drift * (way_m[k] - way_m[a])
+                allowed = tolerance_m + SIGMAS * sigma + slack_m[k] - slack_m[a]
                 if np.sqrt((x[k] - x[a]) ** 2 + (y[k] - y[a]) ** 2) <= allowed:
                     best = length[a]
                     length[k], previous[k] = best + 1, a
@@ -137,7 +137,7 @@ def _chain(
 
 
 def _chord_turns(
-    p: C16, q: C16, way_m: F8, sigma_m: F8, tolerance_m: float, drift: float, keep: Flags, chord_m: float
+    p: C16, q: C16, way_m: F8, slack_m: F8, sigma_m: F8, tolerance_m: float, keep: Flags, chord_m: float
 ) -> tuple[F8, C16]:
     """Way at the middle of each chord between kept fixes whose length agrees, and its turn as a unit number."""
     rows = np.flatnonzero(keep)
@@ -145,9 +145,10 @@ def _chord_turns(
     after = np.searchsorted(way_m[rows], way_m[rows] + chord_m)
     i, j = rows[after < len(rows)], rows[after[after < len(rows)]]
     a, b = p[j] - p[i], q[j] - q[i]
-    allowed = tolerance_m + SIGMAS * np.hypot(sigma_m[i], sigma_m[j]) + drift * (way_m[j] - way_m[i])
+    slack = slack_m[j] - slack_m[i]
+    allowed = tolerance_m + SIGMAS * np.hypot(sigma_m[i], sigma_m[j]) + slack
     long = np.minimum(np.abs(a), np.abs(b)) > 0.3 * chord_m
-    fits = long & (np.abs(np.abs(a) - np.abs(b)) <= allowed)
+    fits = long & (slack < MOST_SLACK * chord_m) & (np.abs(np.abs(a) - np.abs(b)) <= allowed)
     turn = (b * np.conj(a))[fits]
     return 0.5 * (way_m[i] + way_m[j])[fits], turn / np.abs(turn)
 
@@ -165,14 +166,8 @@ def _middle_turn(turn: C16) -> complex:
 
 
 def _turn_chain(turn: C16, station_m: F8) -> Flags:
-    return longest_chain(
-        turn,
-        station_m,
-        np.zeros(len(turn)),
-        float(TURN_RAD),
-        float(TURN_RAD_M),
-        station_m[-1] - station_m[0] + 1.0,
-    )
+    whole = station_m[-1] - station_m[0] + 1.0
+    return longest_chain(turn, station_m, TURN_RAD_M * station_m, np.zeros(len(turn)), float(TURN_RAD), whole)
 
 
 def _scatter(residual: C16) -> float:

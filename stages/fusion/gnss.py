@@ -31,6 +31,7 @@ from scanloom.stages.fusion.receiver import (
 from scanloom.stages.fusion.walk import Walk, random_walk
 from scanloom.stages.geometry.geodesy import geodetic_to_world
 from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.unseen import SEEN_P
 
 __all__ = ["Fixes", "GnssSettings", "contradictions", "judge", "middle", "positions", "refusals", "screen"]
 
@@ -71,7 +72,7 @@ def judge(
     level, way = antenna_level(drive, R_level_odom), drive.travelled_at(drive.gnss.stamp_ns)
     remark = ""
     if len(passed) > 1 and np.ptp(way[passed]) > LEAST_WAY_M:
-        remark = _against_motion(settings, drive.gnss, verdict, level, world, way)
+        remark = _against_motion(settings, drive, verdict, level, world, way)
     kept = np.flatnonzero(verdict == "")
     alignment = None
     if not remark and len(kept) >= 2:
@@ -144,16 +145,19 @@ def antenna_level(drive: Drive, R_level_odom: F8) -> F8:
     return np.asarray((T[:, :3, :3] @ drive.antenna_m + T[:, :3, 3]) @ R_level_odom.T)
 
 
-def _against_motion(settings: GnssSettings, gnss: Gnss, verdict: Texts, level: F8, world: F8, way: F8) -> str:
+def _against_motion(
+    settings: GnssSettings, drive: Drive, verdict: Texts, level: F8, world: F8, way: F8
+) -> str:
     """Mark the fixes that contradict odometry; a remark when too few are left to be believed."""
+    gnss, slack = drive.gnss, settings.motion_drift * way + unseen_way_m(drive)
     passed = np.flatnonzero(verdict == "")
     sigma = receiver_sigma(settings, gnss)[passed]
     p, q, driven = _plane(level[passed]), _plane(world[passed]), way[passed]
 
     def agree(fixes: C16) -> Flags:
         horizontal = sigma[:, :2].max(axis=1, initial=0.0)
-        tolerance, drift = settings.motion_tolerance_m, settings.motion_drift
-        return agreeing(p, fixes, driven, horizontal, tolerance, drift, settings.chain_m)
+        tolerance = settings.motion_tolerance_m
+        return agreeing(p, fixes, driven, slack[passed], horizontal, tolerance, settings.chain_m)
 
     keep = agree(q)
     share = _share_of_way(driven, keep)
@@ -167,11 +171,29 @@ def _against_motion(settings: GnssSettings, gnss: Gnss, verdict: Texts, level: F
         return f"fixes contradict the motion of the vehicle on {100 * (1 - share):.0f} % of its way; none is used"
     mark(verdict, np.isin(np.arange(len(verdict)), passed[~keep]), DISAGREES)
     up = (world - level)[passed[keep], 2] + 0j
+    loose = settings.height_drift / settings.motion_drift * slack[passed][keep]
     steady = longest_chain(
-        up, driven[keep], sigma[keep, 2], settings.height_tolerance_m, settings.height_drift, settings.chain_m
+        up, driven[keep], loose, sigma[keep, 2], settings.height_tolerance_m, settings.chain_m
     )
     mark(verdict, np.isin(np.arange(len(verdict)), passed[keep][~steady]), HEIGHT_JUMPS)
     return ""
+
+
+def unseen_way_m(drive: Drive) -> F8:
+    """Way (n,) up to each fix of which scans did not see every direction, m: there odometry is no judge of GNSS.
+
+    Odometry may have stood still there: a step counts with the vehicle's usual speed when that is more.
+    """
+    odometry = drive.odometry
+    if len(odometry) < 2:
+        return np.zeros(len(drive.gnss))
+    step_s, step_m = np.diff(odometry.stamp_ns) * 1e-9, np.diff(drive.travelled_m)
+    blind = (odometry.direction_p < SEEN_P).any(axis=1) | ~odometry.reliable
+    usual_m = np.median(step_m / np.maximum(step_s, 1e-3)) * step_s
+    lost = np.concatenate(([0.0], np.cumsum(np.where(blind[1:], np.maximum(step_m, usual_m), 0.0))))
+    start = odometry.stamp_ns[0]
+    at, known = (drive.gnss.stamp_ns - start).astype(float), (odometry.stamp_ns - start).astype(float)
+    return np.asarray(np.interp(at, known, lost))
 
 
 def _swapped(gnss: Gnss) -> C16:

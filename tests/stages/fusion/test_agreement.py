@@ -27,7 +27,7 @@ def measured(rng: np.random.Generator, sigma: float) -> np.ndarray:
 
 
 def kept(p: np.ndarray, q: np.ndarray, sigma: float) -> np.ndarray:
-    return agreeing(p, q, WAY, np.full(len(q), sigma), TOLERANCE_M, DRIFT, FARTHEST_M)
+    return agreeing(p, q, WAY, DRIFT * WAY, np.full(len(q), sigma), TOLERANCE_M, FARTHEST_M)
 
 
 def precision_recall(keep: np.ndarray, lying: np.ndarray) -> tuple[float, float]:
@@ -85,7 +85,9 @@ def test_a_pause_does_not_cut_the_chain() -> None:
     there = (WAY < 300.0) | (WAY > 1000.0)
     rng = np.random.default_rng(1)
     q, p = measured(rng, 0.1), by_odometry(1, 2.0)
-    keep = agreeing(p[there], q[there], WAY[there], np.full(there.sum(), 0.1), TOLERANCE_M, DRIFT, FARTHEST_M)
+    keep = agreeing(
+        p[there], q[there], WAY[there], DRIFT * WAY[there], np.full(there.sum(), 0.1), TOLERANCE_M, FARTHEST_M
+    )
     assert keep.mean() > 0.97
 
 
@@ -104,12 +106,28 @@ def test_chain_at_its_tolerance() -> None:
     step[4] = 1.0
     at, beyond = (step * factor * allowed + 0j for factor in (0.999, 1.001))
     sigma = np.full(10, 0.1)
-    assert longest_chain(at, way, sigma, 0.3, 0.02, 400.0).all()
-    np.testing.assert_array_equal(longest_chain(beyond, way, sigma, 0.3, 0.02, 400.0), np.arange(10) != 4)
+    assert longest_chain(at, way, 0.02 * way, sigma, 0.3, 400.0).all()
+    np.testing.assert_array_equal(
+        longest_chain(beyond, way, 0.02 * way, sigma, 0.3, 400.0), np.arange(10) != 4
+    )
 
 
 def test_few_or_standing_fixes() -> None:
     still = np.full(20, 3.0 + 4.0j)
-    assert straightened(still, still, np.zeros(20), np.ones(20), 0.3, 0.02, np.ones(20, bool)) is None
-    assert agreeing(still[:2], still[:2], np.zeros(2), np.ones(2), 0.3, 0.02, 400.0).all()
-    assert len(longest_chain(still[:0], np.zeros(0), np.zeros(0), 0.3, 0.02, 400.0)) == 0
+    assert straightened(still, still, np.zeros(20), np.zeros(20), np.ones(20), 0.3, np.ones(20, bool)) is None
+    assert agreeing(still[:2], still[:2], np.zeros(2), np.zeros(2), np.ones(2), 0.3, 400.0).all()
+    assert len(longest_chain(still[:0], np.zeros(0), np.zeros(0), np.zeros(0), 0.3, 400.0)) == 0
+
+
+def test_where_scans_saw_nothing_gnss_is_not_doubted() -> None:
+    """Odometry loses 12 m over a stretch of 60 m: with slack there all fixes stay, without it one side is lost."""
+    rng = np.random.default_rng(5)
+    p, q = by_odometry(5, 0.5), measured(rng, 0.1)
+    inside = (WAY > 500.0) & (WAY < 560.0)
+    lost = np.cumsum(inside) / inside.sum()
+    heading = np.diff(p, prepend=p[0])[inside].mean()
+    slipped = p - 12.0 * lost * heading / np.abs(heading)
+    slack = DRIFT * WAY + 60.0 * lost
+    sigma = np.full(N, 0.1)
+    assert agreeing(slipped, q, WAY, slack, sigma, TOLERANCE_M, FARTHEST_M).mean() > 0.97
+    assert agreeing(slipped, q, WAY, DRIFT * WAY, sigma, TOLERANCE_M, FARTHEST_M)[WAY < 1000.0].mean() < 0.97

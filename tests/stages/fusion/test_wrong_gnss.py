@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from scanloom.schemas.tracks import Gnss
+from scanloom.stages.fusion.gnss import unseen_way_m
 from scanloom.stages.geometry.geodesy import georeference, world_to_geodetic
-from tests.stages.fusion.drives import START_NS, World, ate, gnss_of, odometry_of, rectangle
+from scanloom.stages.geometry.se3 import inverse
+from tests.stages.fusion.drives import START_NS, World, ate, gnss_of, odometry_of, rectangle, session_of
 from tests.stages.fusion.test_fusion import fuse, in_truth_frame
-from tests.stages.fusion.test_tuning import driven
+from tests.stages.fusion.test_tuning import driven, drives_of
 
 WORLD = driven(np.full(2000, 8.0), rectangle(laps=2.0, a=120.0, b=70.0, speed=1.0))
 ODOMETRY = odometry_of(WORLD, yaw_drift_deg_per_100m=0.5)
@@ -168,6 +170,28 @@ def test_a_vehicle_that_stands_is_no_frozen_receiver() -> None:
     assert len(still) > 40
     assert not any("stands still" in v for v in verdict)
     assert poses.frame == "world"
+
+
+def test_where_scans_saw_nothing_gnss_decides() -> None:
+    """Odometry loses 12 m of 24 along a wall-less stretch: said to be unseen, no fix is blamed; unsaid, some are."""
+    rows = slice(400, 430)
+    T, p = ODOMETRY.T_odom_lidar.copy(), ODOMETRY.direction_p.copy()
+    step = inverse(T[:-1]) @ T[1:]
+    step[rows, :3, 3] *= 0.5
+    for k in range(rows.start, len(T) - 1):
+        T[k + 1] = T[k] @ step[k]
+    p[rows.start + 1 : rows.stop + 1, 0] = 0.0
+    slipped = dataclasses.replace(ODOMETRY, T_odom_lidar=T)
+    blamed = []
+    for track in (slipped, dataclasses.replace(slipped, direction_p=p)):
+        _, graph = fuse(GNSS, odometry=track, world=WORLD)
+        blamed.append(sum("disagrees" in v for v in graph.verdict[graph.kind == "gnss"]))
+    assert blamed[0] > 3
+    assert blamed[1] == 0
+    drive = drives_of(session_of("a", WORLD), GNSS, dataclasses.replace(slipped, direction_p=p))[0]
+    lost = unseen_way_m(drive)
+    assert lost[0] == 0.0
+    assert lost[-1] == pytest.approx(30 * 0.8, rel=0.05), "at the usual speed, not at odometry's"
 
 
 def test_a_straight_drive_with_a_wrong_sign_cannot_be_told() -> None:
