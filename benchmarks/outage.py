@@ -49,29 +49,54 @@ def figures(store: Path) -> Iterator[Figure]:
         yield from _with_and_without(seed, given)
         errors = {name: _errors(given, settings) for name, settings in VARIANTS.items()}
         for name, e in errors.items():
-            prefix = f"sample.seed_{seed}.outage_60s.{name}"
-            how = f"fused without the fixes of {OUTAGE_S:g} s around the tunnel; distance to truth after one rigid alignment"
-            yield Figure(f"{prefix}.ate_rmse_m", alignment.rms(e.distance_m), "m", f"root mean square: {how}")
-            yield Figure(
-                f"{prefix}.blanked_rmse_m",
-                alignment.rms(e.distance_m[e.blanked]),
-                "m",
-                f"of the outage: {how}",
-            )
-            yield Figure(
-                f"{prefix}.blanked_max_m",
-                float(e.distance_m[e.blanked].max()),
-                "m",
-                f"largest of the outage: {how}",
-            )
+            yield from _of(f"sample.seed_{seed}.outage_60s.{name}", e)
         ratios.append(alignment.rms(errors["aware"].distance_m) / alignment.rms(errors["fixed"].distance_m))
         worst.append(float(errors["aware"].distance_m[errors["aware"].blanked].max()))
     over = f"over {len(SEEDS)} seeds of the sample"
-    yield Figure("sample.outage_60s.max_m", max(worst), "m", f"largest error in the outage {over}")
-    yield Figure(
+    yield _map("sample.outage_60s.max_m", max(worst), "m", f"largest error in the outage {over}")
+    yield _map(
         "sample.outage_60s.ate_ratio", float(np.mean(ratios)), "", f"ATE aware over fixed, mean {over}"
     )
-    yield Figure("sample.outage_60s.ate_ratio_worst", max(ratios), "", f"the same, worst {over}")
+    yield _map("sample.outage_60s.ate_ratio_worst", max(ratios), "", f"the same, worst {over}")
+
+
+def _map(name: str, value: float, unit: str, method: str) -> Figure:
+    return Figure(name, value, unit, "map", method)
+
+
+def _of(prefix: str, e: Errors) -> Iterator[Figure]:
+    how = (
+        f"without the fixes of {OUTAGE_S:g} s around the tunnel; distance to truth after one rigid alignment"
+    )
+    blanked = e.distance_m[e.blanked]
+    yield _map(f"{prefix}.ate_rmse_m", alignment.rms(e.distance_m), "m", f"root mean square: {how}")
+    yield _map(
+        f"{prefix}.blanked_rmse_m", alignment.rms(blanked), "m", f"root mean square in the outage: {how}"
+    )
+    yield _map(f"{prefix}.blanked_max_m", float(blanked.max()), "m", f"largest in the outage: {how}")
+
+
+def _with_and_without(seed: int, given: Mapping[type[Product], Any]) -> Iterator[Figure]:
+    for name, length_s in (("with_gnss", 0.0), ("without_gnss", float("inf"))):
+        e = _errors(given, Settings(), length_s)
+        how = f"{name.replace('_', ' ')}: root mean square distance to truth after one rigid alignment"
+        yield _map(f"sample.seed_{seed}.{name}.ate_rmse_m", alignment.rms(e.distance_m), "m", how)
+
+
+def _errors(given: Mapping[type[Product], Any], settings: Settings, length_s: float = OUTAGE_S) -> Errors:
+    odometry: Odometry = given[Odometry][0]
+    truth: Truth = given[Truth][0]
+    middle_ns = _tunnel_ns(odometry)
+    blanked = {**given, Gnss: _without(given[Gnss], middle_ns, length_s)}
+    poses = next(
+        part.product
+        for part in fusion(settings, *[blanked.get(p) for p in FUSION.reads])
+        if isinstance(part.product, Poses)
+    )
+    known = inside(truth.stamp_ns, poses.stamp_ns)
+    true = interpolate_poses(truth.stamp_ns, truth.T_truth_lidar, poses.stamp_ns[known])
+    near = np.abs(poses.stamp_ns[known] - middle_ns) < 0.5e9 * length_s
+    return Errors(alignment.absolute_errors(true, poses.T_world_lidar[known]), near)
 
 
 def _made(seed: int, store: Path) -> dict[type[Product], Any]:
@@ -97,22 +122,6 @@ def _with_and_without(seed: int, given: Mapping[type[Product], Any]) -> Iterator
         e = _errors(given, Settings(), length_s)
         how = f"{name.replace('_', ' ')}: root mean square distance to truth after one rigid alignment"
         yield Figure(f"sample.seed_{seed}.{name}.ate_rmse_m", alignment.rms(e.distance_m), "m", how)
-
-
-def _errors(given: Mapping[type[Product], Any], settings: Settings, length_s: float = OUTAGE_S) -> Errors:
-    odometry: Odometry = given[Odometry][0]
-    truth: Truth = given[Truth][0]
-    middle_ns = _tunnel_ns(odometry)
-    blanked = {**given, Gnss: _without(given[Gnss], middle_ns, length_s)}
-    poses = next(
-        part.product
-        for part in fusion(settings, *[blanked.get(p) for p in FUSION.reads])
-        if isinstance(part.product, Poses)
-    )
-    known = inside(truth.stamp_ns, poses.stamp_ns)
-    true = interpolate_poses(truth.stamp_ns, truth.T_truth_lidar, poses.stamp_ns[known])
-    near = np.abs(poses.stamp_ns[known] - middle_ns) < 0.5e9 * length_s
-    return Errors(alignment.absolute_errors(true, poses.T_world_lidar[known]), near)
 
 
 def _tunnel_ns(odometry: Odometry) -> int:
