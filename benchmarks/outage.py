@@ -117,13 +117,6 @@ def _parts(result: Result, product: type[Product]) -> Any:
     return found if found and "session" in dict(next(iter(result.files(product)))[0]) else found[0]
 
 
-def _with_and_without(seed: int, given: Mapping[type[Product], Any]) -> Iterator[Figure]:
-    for name, length_s in (("with_gnss", 0.0), ("without_gnss", float("inf"))):
-        e = _errors(given, Settings(), length_s)
-        how = f"{name.replace('_', ' ')}: root mean square distance to truth after one rigid alignment"
-        yield Figure(f"sample.seed_{seed}.{name}.ate_rmse_m", alignment.rms(e.distance_m), "m", how)
-
-
 def _tunnel_ns(odometry: Odometry) -> int:
     """Middle of the first stretch of a second or more in which registration missed a direction: the tunnel comes before the field."""
     blind = (odometry.direction_p < 0.5).any(axis=1)
