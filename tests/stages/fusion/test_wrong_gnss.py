@@ -120,9 +120,11 @@ def test_part_of_the_log_is_wrong_and_the_rest_is_used(name: str, part: tuple[fl
     poses, graph = fuse(PARTS[name](rows), odometry=ODOMETRY, world=WORLD)
     used = graph.verdict[graph.kind == "gnss"] == "used"
     assert poses.frame == "world"
-    assert used[rows].sum() <= 1, "the first of a frozen run still is where it says"
+    assert used[rows].sum() <= 0.02 * rows.sum(), (
+        "by chance some of those that jump are near where they should be"
+    )
     assert used[~rows].sum() > 40
-    assert 0.01 < ate(in_truth_frame(poses), WORLD.T, align=False) < 1.5
+    assert 0.01 < ate(in_truth_frame(poses), WORLD.T, align=False) < 2.0, "what odometry drifts without fixes"
 
 
 def test_the_share_of_contradicting_fixes_is_said() -> None:
