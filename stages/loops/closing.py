@@ -16,7 +16,7 @@ from scanloom.stages.loops.candidates import Candidate, CandidateSettings, Track
 from scanloom.stages.loops.consistency import ConsistencySettings, inconsistent
 from scanloom.stages.loops.reading import ScanShelf, joined
 from scanloom.stages.loops.submaps import SubmapSettings, SubmapShelf
-from scanloom.stages.loops.verification import Verdict, VerificationSettings, verify
+from scanloom.stages.loops.verification import Drift, Verdict, VerificationSettings, verify
 
 VERSION = 1
 
@@ -54,7 +54,7 @@ def loops(
     tracks, shelves = _tracks(deskewed, labels, odometry, places)
     found = candidates(settings.candidates, tracks)
     shelf = SubmapShelf(settings.submaps, tracks, shelves)
-    verdicts = [_verified(settings, shelf, tracks, c) for c in found]
+    verdicts = _verified(settings.verification, shelf, tracks, found)
     passed = [k for k, v in enumerate(verdicts) if not v.reason]
     gone = inconsistent(settings.consistency, tracks, [(found[k], verdicts[k].T_i_j) for k in passed])
     reasons = [v.reason for v in verdicts]
@@ -84,9 +84,28 @@ def _tracks(
     return tracks, shelves
 
 
-def _verified(settings: Settings, shelf: SubmapShelf, tracks: Sequence[Track], c: Candidate) -> Verdict:
-    path = float(tracks[c.b].travelled_m[c.j] - tracks[c.a].travelled_m[c.i]) if c.a == c.b else 0.0
-    return verify(settings.verification, c, path, shelf.around(c.a, c.i), shelf.around(c.b, c.j))
+def _verified(
+    settings: VerificationSettings, shelf: SubmapShelf, tracks: Sequence[Track], found: Sequence[Candidate]
+) -> list[Verdict]:
+    """Verdicts in the order of the candidates; taken place by place, so that clouds are read once for neighbours."""
+    order = sorted(range(len(found)), key=lambda k: (found[k].b, found[k].j, found[k].a, found[k].i))
+    verdicts = {
+        k: verify(
+            settings, found[k], _drift(tracks, found[k]), shelf.around(found[k].a, found[k].i),
+            shelf.around(found[k].b, found[k].j),
+        )
+        for k in order
+    }  # fmt: skip
+    return [verdicts[k] for k in range(len(found))]
+
+
+def _drift(tracks: Sequence[Track], c: Candidate) -> Drift:
+    if c.a != c.b:
+        return Drift(0.0)
+    track = tracks[c.a]
+    return Drift(
+        float(track.travelled_m[c.j] - track.travelled_m[c.i]), *track.whereabouts.spread_m(c.i, c.j)
+    )
 
 
 def _table(

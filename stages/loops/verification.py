@@ -94,14 +94,20 @@ class VerificationSettings(MatchingSettings):
     drift_m: float = Field(
         default=3.0, gt=0, le=100, description="difference from odometry always allowed, m"
     )
+    drift_sigmas: float = Field(
+        default=4.0, gt=0, le=20, description="and so many standard deviations of its relative marginal"
+    )
     drift_share: float = Field(
-        default=0.04, gt=0, le=1, description="difference from odometry allowed per metre driven"
+        default=0.005,
+        gt=0,
+        le=1,
+        description="standard deviation of odometry's systematic error, which its covariances do not hold, per metre driven",
     )
     vertical_drift_m: float = Field(
         default=1.0, gt=0, le=100, description="vertical difference always allowed, m"
     )
     vertical_drift_share: float = Field(
-        default=0.015, gt=0, le=1, description="vertical difference allowed per metre driven"
+        default=0.003, gt=0, le=1, description="the same as drift_share for the height"
     )
     floor_m: float = Field(
         default=0.05, gt=0, le=5, description="smallest standard deviation of a loop's translation, m"
@@ -127,6 +133,26 @@ class Verdict:
 
 
 @dataclass(frozen=True)
+class Drift:
+    """What odometry knows of its error between the two keyframes of a candidate."""
+
+    path_m: float
+    flat_m: float = 0.0
+    """Standard deviation of its relative marginal, the larger one in the horizontal plane."""
+    up_m: float = 0.0
+
+    def allowed_m(self, settings: VerificationSettings) -> float:
+        """Largest difference from odometry's pose."""
+        sigma = np.hypot(self.flat_m, settings.drift_share * self.path_m)
+        return float(settings.drift_m + settings.drift_sigmas * sigma)
+
+    def allowed_lift_m(self, settings: VerificationSettings) -> float:
+        """Largest difference from odometry's height."""
+        sigma = np.hypot(self.up_m, settings.vertical_drift_share * self.path_m)
+        return float(settings.vertical_drift_m + settings.drift_sigmas * sigma)
+
+
+@dataclass(frozen=True)
 class Evidence:
     """What is known of the best match: everything that is tested."""
 
@@ -145,14 +171,18 @@ class Evidence:
         return self.match.registration
 
 
-def verify(settings: VerificationSettings, c: Candidate, path_m: float, i: Submap, j: Submap) -> Verdict:
-    """Pose of LiDAR j in LiDAR i and whether to believe it. `path_m` is the path driven in between (0 between sessions)."""
+def verify(settings: VerificationSettings, c: Candidate, drift: Drift, i: Submap, j: Submap) -> Verdict:
+    """Pose of LiDAR j in LiDAR i and whether to believe it. `drift` is not looked at where odometry predicts nothing."""
+    if c.predicted is not None:
+        far = float(np.linalg.norm(c.predicted[:3, 3])) - settings.max_distance_m
+        if far > drift.allowed_m(settings):
+            return _nothing(f"contradicts odometry by more than {far:.0f} m after {drift.path_m:.0f} m")
     prior = prior_of(settings, c.predicted, c.yaw_rad, i, j)
-    return decide(settings, c, path_m, i, j, proposals(settings, i, j, prior))
+    return decide(settings, c, drift, i, j, proposals(settings, i, j, prior))
 
 
 def decide(
-    settings: VerificationSettings, c: Candidate, path_m: float, i: Submap, j: Submap, found: Sequence[Peak]
+    settings: VerificationSettings, c: Candidate, drift: Drift, i: Submap, j: Submap, found: Sequence[Peak]
 ) -> Verdict:
     """The second stage alone: what becomes of the peaks that the search has found."""
     if not found:
@@ -160,7 +190,7 @@ def decide(
         return _nothing("nothing upright to compare" if bare else "nowhere do the submaps look alike")
     target = Target(i)
     e = _evidence(settings, refined(settings, target, j, found), target, j)
-    reason = _refusal(settings, e, c, path_m, target, j)
+    reason = _refusal(settings, e, c, drift, target, j)
     r = e.registration
     return Verdict(
         e.T_i_j, _covariance(settings, r, j), e.inlier_ratio, r.rmse_m, e.overlap, e.match.seen_through, e.seen.e_m,
@@ -198,11 +228,11 @@ def _evidence(settings: VerificationSettings, matches: list[Match], target: Targ
 
 
 def _refusal(
-    settings: VerificationSettings, e: Evidence, c: Candidate, path_m: float, target: Target, j: Submap
+    settings: VerificationSettings, e: Evidence, c: Candidate, drift: Drift, target: Target, j: Submap
 ) -> str:
     """Why not to believe it; empty when there is nothing to say. Costly tests come last."""
     doubts = _doubts(settings, e)
-    reason = _unfit(settings, e) or _implausible(settings, c, path_m, e.T_i_j)
+    reason = _unfit(settings, e) or _implausible(settings, c, drift, e.T_i_j)
     if len(doubts) > 4 - LEAST_AGREEING:
         return doubts[0]
     reason = reason or _indistinct(settings, target, j, e.match.T)
@@ -257,16 +287,16 @@ def _unfit(settings: VerificationSettings, e: Evidence) -> str:
     return next((text for passed, text in tests if not passed), "")
 
 
-def _implausible(settings: VerificationSettings, c: Candidate, path_m: float, T_i_j: F8) -> str:
+def _implausible(settings: VerificationSettings, c: Candidate, drift: Drift, T_i_j: F8) -> str:
     """Odometry drifts, but not that far; above all it tells the decks of a bridge apart."""
     if c.predicted is None:
         return ""
     off = float(np.linalg.norm((inverse(c.predicted) @ T_i_j)[:3, 3]))
-    if off > settings.drift_m + settings.drift_share * path_m:
-        return f"contradicts odometry by {off:.1f} m after {path_m:.0f} m"
+    if off > drift.allowed_m(settings):
+        return f"contradicts odometry by {off:.1f} m after {drift.path_m:.0f} m"
     lift = abs(float(T_i_j[2, 3] - c.predicted[2, 3]))
-    if lift > settings.vertical_drift_m + settings.vertical_drift_share * path_m:
-        return f"contradicts odometry's height by {lift:.1f} m after {path_m:.0f} m"
+    if lift > drift.allowed_lift_m(settings):
+        return f"contradicts odometry's height by {lift:.1f} m after {drift.path_m:.0f} m"
     return ""
 
 

@@ -13,11 +13,11 @@ from scanloom.stages.geometry.voxels import downsample
 from scanloom.stages.loops.candidates import Candidate
 from scanloom.stages.loops.matching import prior_of
 from scanloom.stages.loops.submaps import Submap, _levelled
-from scanloom.stages.loops.verification import Verdict, VerificationSettings, verify
+from scanloom.stages.loops.verification import Drift, Verdict, VerificationSettings, verify
 from tests.stages.loops.worlds import block, labels_of, polyline, scans_of
 from tests.worlds import GROUND_Z_M, BoxWorld
 
-PATH_M = 1e5
+DRIFT = Drift(1e5)
 FAR_OFF = pose(so3_exp(np.radians([2.0, -3.0, 14.0])), np.array([4.0, -5.0, 2.0]))
 """A prior's error: more than one sigma of the highest level in every direction."""
 
@@ -38,7 +38,7 @@ def judged(
     i: Submap, j: Submap, predicted: F8 | None, settings: VerificationSettings | None = None
 ) -> Verdict:
     c = Candidate(0, 0, 0, 1, float("nan"), float("nan"), predicted, 0.0)
-    return verify(settings or VerificationSettings(), c, PATH_M, i, j)
+    return verify(settings or VerificationSettings(), c, DRIFT, i, j)
 
 
 def off(T: F8, true: F8) -> tuple[float, float]:
@@ -191,10 +191,32 @@ def test_a_loop_in_doubt_is_refused_and_says_so(limits: dict[str, float], says: 
     assert v.reason.startswith(says)
 
 
-def test_odometry_that_says_otherwise() -> None:
-    c = Candidate(0, 0, 0, 1, float("nan"), float("nan"), between(SOUTH, AGAIN) @ FAR_OFF, 0.0)
-    near = verify(VerificationSettings(), c, 60.0, street("south"), street("again"))
-    assert "contradicts odometry" in near.reason
+def candidate(predicted: F8) -> Candidate:
+    return Candidate(0, 0, 0, 1, float("nan"), float("nan"), predicted, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("drift", "believed"), [(Drift(60.0), False), (Drift(60.0, 1.0, 0.3), True), (Drift(1500.0), True)]
+)
+def test_odometry_that_says_otherwise_is_believed_as_far_as_it_knows(drift: Drift, believed: bool) -> None:
+    predicted = between(SOUTH, AGAIN) @ FAR_OFF
+    v = verify(VerificationSettings(), candidate(predicted), drift, street("south"), street("again"))
+    assert (v.reason == "") == believed
+    assert believed or "contradicts odometry" in v.reason
+
+
+def test_what_odometry_places_far_away_is_not_even_looked_at() -> None:
+    away = pose(np.eye(3), [60.0, 0.0, 0.0])
+    v = verify(VerificationSettings(), candidate(away), Drift(100.0), street("south"), street("again"))
+    assert v.reason == "contradicts odometry by more than 40 m after 100 m"
+
+
+def test_drift_that_is_allowed() -> None:
+    settings = VerificationSettings()
+    assert Drift(0.0).allowed_m(settings) == settings.drift_m
+    assert Drift(1000.0).allowed_m(settings) == pytest.approx(3.0 + 4 * 5.0)
+    assert Drift(1000.0, 12.0).allowed_m(settings) == pytest.approx(3.0 + 4 * 13.0)
+    assert Drift(1000.0, 12.0).allowed_lift_m(settings) == pytest.approx(1.0 + 4 * 3.0)
 
 
 def test_where_is_looked() -> None:
