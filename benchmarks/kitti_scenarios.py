@@ -60,7 +60,7 @@ def _bursts(time_s: F8, rng: np.random.Generator) -> tuple[F8, NDArray[np.bool_]
     for start in starts:
         inside = (time_s >= start) & (time_s < start + BURST_S)
         shift[inside, :2] = rng.normal(0.0, BURST_SIGMA_M, 2)
-    return shift, shift.any(axis=1)
+    return shift, np.asarray(shift.any(axis=1))
 
 
 def _sideways(length_m: F8, direction_rad: F8) -> F8:
