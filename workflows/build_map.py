@@ -29,7 +29,7 @@ from scanloom.stages.report.page import compose, run_section
 from scanloom.workflows.configuration import Overrides, merged
 from scanloom.workflows.delivery import Label, Metric, change_rows, claim, deliver, metric_rows, write_text
 from scanloom.workflows.map_session import NODES
-from scanloom.workflows.parent import Parent, check_logs, check_new
+from scanloom.workflows.parent import Parent, altered_tiles, check_logs, check_new
 from scanloom.workflows.sessions import Sought, find_sessions
 from scanloom.workflows.sources import log_digests, write_sources
 
@@ -108,7 +108,7 @@ def build_map(order: Order, progress: Progress | None = None) -> Outcome:
         metrics=metrics,
         executed=result.executed,
         failures=failures,
-        warnings=_warnings(result),
+        warnings=_warnings(result) + (_on_tiles(order) if delivered else []),
         result=result,
     )
 
@@ -247,6 +247,21 @@ def _warnings(result: Result) -> list[str]:
     left_out = [error.what for error in _left_out(result).values()]
     of_fusion = [text for graph in result.parts(Graph) for text in graph.warnings]
     return of_logs + [text for text in of_fusion if not any(text.startswith(what) for what in left_out)]
+
+
+def _on_tiles(order: Order) -> list[str]:
+    """What an extension that keeps the old poses should not have changed, and did."""
+    mode = order.settings.get("fusion", {}).get("extension")
+    if order.parent is None or mode == "soft":
+        return []
+    altered = altered_tiles(order.parent, order.out)
+    if not altered:
+        return []
+    return [
+        f"{len(altered)} tiles that no new session reached are not as in {order.parent.name}, though its poses stayed "
+        f"({', '.join(altered[:3])}{', ...' * (len(altered) > 3)}): that map was made by another version of the program, or "
+        "with other settings"
+    ]
 
 
 def _failures(result: Result) -> list[tuple[str, ScanloomError]]:

@@ -12,8 +12,9 @@ from typing import Any
 from scanloom.pipeline.store import Store
 from scanloom.schemas.base import BaseLog
 from scanloom.schemas.errors import InvalidInput, ScanloomError, UsageError
+from scanloom.schemas.tiles import TileIndex
 from scanloom.workflows.configuration import Overrides
-from scanloom.workflows.delivery import MAP_FILE, MAP_FORMAT, trajectory_file
+from scanloom.workflows.delivery import MAP_FILE, MAP_FORMAT, read_map, trajectory_file
 from scanloom.workflows.sessions import Sought, find
 from scanloom.workflows.sources import SOURCES_FILE, SourceOfSession, Sources, log_digest, read_sources
 
@@ -35,6 +36,8 @@ class Parent:
     """Digest of each session's log."""
     settings: Overrides
     store: Path
+    files: Mapping[str, Any]
+    """Size and checksum of every file of the map."""
 
     def reference(self) -> dict[str, Any]:
         """How `map.json` of the extension names it."""
@@ -67,6 +70,7 @@ def read_parent(folder: Path, moved: Mapping[str, str] | None = None) -> Parent:
         logs={str(row["name"]): str(row.get("log", "")) for row in content["sessions"]},
         settings=sources.settings,
         store=Path(sources.store),
+        files=content["files"],
     )
 
 
@@ -102,6 +106,19 @@ def check_new(parent: Parent, session: Sought, store: Store) -> None:
                 where=session.word,
                 next_step="add a log that the map does not hold yet",
             )
+
+
+def altered_tiles(parent: Parent, out: Path) -> list[str]:
+    """Tiles of the map in `out` that no new session reached and that are not the parent's, byte by byte."""
+    old = {session.name for session in parent.sessions}
+    files = read_map(out).get("files", {})
+    index = TileIndex.open(out / "tiles" / "index.parquet")
+    return [
+        str(tile)
+        for tile, sessions in zip(index.tile, index.sessions, strict=True)
+        if set(sessions.split()) <= old
+        and files.get(f"tiles/{tile}.parquet") != parent.files.get(f"tiles/{tile}.parquet")
+    ]
 
 
 def _map_file(folder: Path) -> tuple[dict[str, Any], str]:

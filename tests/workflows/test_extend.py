@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from scanloom.schemas.errors import EXIT_SOME_FAILED, InvalidInput, UsageError
 from scanloom.schemas.tiles import TileIndex
 from scanloom.schemas.trajectory import Poses
 from scanloom.workflows.build_map import Order, Outcome, build_map, plan_map
+from scanloom.workflows.configuration import merged
 from scanloom.workflows.extend_map import extension_order, moved_logs
 from scanloom.workflows.parent import read_parent
 from scanloom.workflows.sessions import find_sessions
@@ -152,6 +154,14 @@ def test_again_computes_nothing_and_changes_no_byte(world: Path, second: Outcome
     assert again.executed == 0
     assert bytes_of(second.out) == before
     assert bytes_of(world / "maps/monday") == parent
+
+
+def test_other_settings_that_alter_old_tiles_are_named(world: Path, second: Outcome) -> None:
+    assert not second.warnings
+    order = extended(world, [str(world / "logs" / "tuesday")], out="coarse")
+    coarse = replace(order, command_line=merged(order.command_line, {"tiles": {"min_points": 2}}))
+    (warning,) = made(coarse).warnings
+    assert "are not as in monday" in warning and "other settings" in warning
 
 
 def test_soft_gives_a_map_too(world: Path) -> None:
