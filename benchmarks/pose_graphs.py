@@ -18,7 +18,7 @@ from scanloom.stages.fusion.factors import Factor
 from scanloom.stages.geometry.se3 import F8, matrix_from_quaternion, pose, so3_exp
 
 FLAT_SIGMA = 1e-3
-"""Of roll, pitch (rad) and height (m) in a plane graph, which says nothing of them: they stay zero."""
+"""Of roll, pitch (rad) and height (m) along odometry in a plane graph, which says nothing of them: they stay zero."""
 IN_PLANE = (3, 4, 2)
 """Where x, y and yaw of the plane stand in a tangent of space, in g2o's order."""
 
@@ -64,10 +64,10 @@ def read(path: Path) -> PoseGraph:
             nodes[int(words[0])] = _pose(_numbers(words[1:8]))
         elif tag == "EDGE_SE2":
             v = _numbers(words[2:])
-            factors.append(_edge(words, _flat_pose(v[:3]), flat_covariance(v[3:]), 3))
+            factors.append(_edge(words, _flat_pose(v[:3]), flat_covariance(v[3:], _is_odometry(words))))
         elif tag == "EDGE_SE3:QUAT":
             v = _numbers(words[2:])
-            factors.append(_edge(words, _pose(v[:7]), covariance(v[7:]), 6))
+            factors.append(_edge(words, _pose(v[:7]), covariance(v[7:])))
         elif tag and tag != "FIX":
             raise ValueError(f"{path.name} holds {tag}, which is not read")
     return PoseGraph(path.stem, np.array([nodes[k] for k in sorted(nodes)]), factors, flat)
@@ -87,16 +87,20 @@ def covariance(upper: F8) -> F8:
     return np.asarray(np.linalg.inv(information(upper))[np.ix_(order, order)])
 
 
-def flat_covariance(upper: F8) -> F8:
-    """Covariance (6, 6) of a plane edge's 6 numbers of information (x, y, yaw)."""
-    out = np.eye(6) * FLAT_SIGMA**2
+def flat_covariance(upper: F8, odometry: bool) -> F8:
+    """Covariance (6, 6) of a plane edge's 6 numbers of information (x, y, yaw); what a loop does not tell is infinite."""
+    out = np.diag(np.full(6, FLAT_SIGMA**2 if odometry else np.inf))
     out[np.ix_(IN_PLANE, IN_PLANE)] = np.linalg.inv(information(upper))
     return out
 
 
-def _edge(words: list[str], measurement: F8, C: F8, freedom: int) -> Factor:
-    i, j = int(words[0]), int(words[1])
-    return Factor("odometry" if j == i + 1 else "loop", i, j, measurement, C)
+def _edge(words: list[str], measurement: F8, C: F8) -> Factor:
+    kind = "odometry" if _is_odometry(words) else "loop"
+    return Factor(kind, int(words[0]), int(words[1]), measurement, C)
+
+
+def _is_odometry(words: list[str]) -> bool:
+    return int(words[1]) == int(words[0]) + 1
 
 
 def _numbers(words: list[str]) -> NDArray[np.float64]:

@@ -6,11 +6,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scanloom.schemas.pose_graph import Graph
 from scanloom.stages.geometry.se3 import F8, inverse, se3_log
 
 USED = "used"
+BETWEEN, PRIOR, POSITION, UP = range(4)
+SHAPE = {
+    "odometry": BETWEEN, "wheel": BETWEEN, "loop": BETWEEN, "prior": PRIOR, "base": PRIOR, "gnss": POSITION, "gravity": UP,
+}  # fmt: skip
+"""What a factor of a kind is to the solver."""
+COMPONENTS = {BETWEEN: slice(0, 6), PRIOR: slice(0, 6), POSITION: slice(3, 6), UP: slice(0, 2)}
+"""Which rows of its covariance count."""
+DOUBTED = ("loop", "gnss")
 
 
 @dataclass
@@ -20,6 +29,7 @@ class Factor:
     kind `odometry`, `wheel`, `loop`, `prior`, `base`: `measurement` is the pose of j in i, or of i itself;
     kind `gnss`: position (3,) of the antenna in the last column, `arm_m` the antenna in the frame of node i;
     kind `gravity`: up (3,) in the frame of node i in the last column.
+    A direction that was not measured at all has an infinite variance.
     """
 
     kind: str
@@ -35,56 +45,62 @@ class Factor:
     @property
     def doubted(self) -> bool:
         """The solver may switch it off."""
-        return self.kind in ("loop", "gnss")
+        return self.kind in DOUBTED
 
 
 def whitened_norms(factors: Sequence[Factor], T: F8) -> F8:
     """Norm (m,) of each factor's whitened residual at nodes T (n, 4, 4); NaN where there is no measurement."""
     out = np.full(len(factors), np.nan)
-    for kind, residuals in _RESIDUALS.items():
-        rows = np.array([k for k, f in enumerate(factors) if f.kind == kind], np.int64)
+    shapes = np.array([SHAPE[f.kind] for f in factors], np.int64)
+    for shape, residuals in _RESIDUALS.items():
+        rows = np.flatnonzero(shapes == shape)
         if len(rows):
-            chosen = [factors[k] for k in rows]
-            error, block = residuals(chosen, T)
-            covariance = np.array([f.covariance for f in chosen])[:, block, block]
+            chosen = [factors[int(k)] for k in rows]
+            block = COMPONENTS[shape]
+            covariance, measured = certain(np.array([f.covariance for f in chosen])[:, block, block])
+            error = np.where(measured, residuals(chosen, T), 0.0)
             with np.errstate(invalid="ignore"):
                 square = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
                 out[rows] = np.sqrt(np.maximum(square, 0.0))
     return out
 
 
-def _between(factors: Sequence[Factor], T: F8) -> tuple[F8, slice]:
+def certain(covariance: F8) -> tuple[F8, NDArray[np.bool_]]:
+    """Covariances (m, k, k) with a unit variance of their own for directions not measured, and which are (m, k)."""
+    measured = ~np.isinf(np.diagonal(covariance, axis1=1, axis2=2))
+    both = measured[:, :, None] & measured[:, None, :]
+    return np.where(both, covariance, np.eye(covariance.shape[1])), np.asarray(measured)
+
+
+def _between(factors: Sequence[Factor], T: F8) -> F8:
     i, j = np.array([f.i for f in factors]), np.array([f.j for f in factors])
     measured = np.array([f.measurement for f in factors])
-    return se3_log(inverse(measured) @ inverse(T[i]) @ T[j]), slice(0, 6)
+    return se3_log(inverse(measured) @ inverse(T[i]) @ T[j])
 
 
-def _prior(factors: Sequence[Factor], T: F8) -> tuple[F8, slice]:
+def _prior(factors: Sequence[Factor], T: F8) -> F8:
     measured = np.array([f.measurement for f in factors])
-    return se3_log(inverse(measured) @ T[[f.i for f in factors]]), slice(0, 6)
+    return se3_log(inverse(measured) @ T[[f.i for f in factors]])
 
 
-def _gnss(factors: Sequence[Factor], T: F8) -> tuple[F8, slice]:
+def _gnss(factors: Sequence[Factor], T: F8) -> F8:
     at = T[[f.i for f in factors]]
     arm = np.array([f.arm_m for f in factors])
     position = np.einsum("nij,nj->ni", at[:, :3, :3], arm) + at[:, :3, 3]
-    return position - np.array([f.measurement[:3, 3] for f in factors]), slice(3, 6)
+    return np.asarray(position - np.array([f.measurement[:3, 3] for f in factors]))
 
 
-def _gravity(factors: Sequence[Factor], T: F8) -> tuple[F8, slice]:
+def _gravity(factors: Sequence[Factor], T: F8) -> F8:
     up = np.array([f.measurement[:3, 3] for f in factors])
     world = np.einsum("nij,nj->ni", T[[f.i for f in factors], :3, :3], up)
-    return np.column_stack((world[:, 1], -world[:, 0])), slice(0, 2)
+    return np.column_stack((world[:, 1], -world[:, 0]))
 
 
-_RESIDUALS: dict[str, Callable[[Sequence[Factor], F8], tuple[F8, slice]]] = {
-    "odometry": _between,
-    "wheel": _between,
-    "loop": _between,
-    "prior": _prior,
-    "base": _prior,
-    "gnss": _gnss,
-    "gravity": _gravity,
+_RESIDUALS: dict[int, Callable[[Sequence[Factor], F8], F8]] = {
+    BETWEEN: _between,
+    PRIOR: _prior,
+    POSITION: _gnss,
+    UP: _gravity,
 }
 
 
@@ -93,7 +109,7 @@ def position_residuals(factors: Sequence[Factor], T: F8) -> F8:
     out = np.full((len(factors), 3), np.nan)
     rows = np.array([k for k, f in enumerate(factors) if f.kind == "gnss"], np.int64)
     if len(rows):
-        out[rows] = _gnss([factors[k] for k in rows], T)[0]
+        out[rows] = _gnss([factors[k] for k in rows], T)
     return out
 
 
