@@ -181,7 +181,7 @@ def _asked(result: Result, T_town_map: F8) -> F8:
     """Standing points (n, 3) of the old map in the town's frame."""
     tiles = result.parts(Piece).by("tile")
     old = [
-        standing_points(tile, [piece for where, piece in parts.items() if where["session"] == OLD], 0.2)
+        standing_points(tile, [piece for where, piece in parts.items() if where["session"] == OLD], 0.2, 0.3)
         for tile, parts in tiles.items()
         if any(where["session"] == OLD for where in parts.coordinates())
     ]

@@ -21,6 +21,12 @@ class Settings(BaseModel):
     thinning_m: float = Field(
         0.2, ge=0.05, le=2.0, description="one point of the old map is asked per voxel of this edge, m"
     )
+    clearance_m: float = Field(
+        0.3,
+        ge=0.0,
+        le=5.0,
+        description="points less than this above the lowest one around them are not asked, m",
+    )
     margin_m: float = Field(
         0.5, ge=0.05, le=5.0, description="a ray passed when it ended by so much behind the point, m"
     )

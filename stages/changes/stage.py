@@ -96,7 +96,8 @@ def _rounds(
         low = np.array(corner_of(name, size_m))
         if not AskedTile(low, low + size_m, np.empty((0, 3))).near(places, settings.max_range_m).any():
             continue
-        points = standing_points(name, [pieces[n] for n in numbers[name]], settings.thinning_m)
+        own = [pieces[n] for n in numbers[name]]
+        points = standing_points(name, own, settings.thinning_m, settings.clearance_m)
         waiting.append(AskedTile.of(points))
         if len(waiting) == TILES_AT_ONCE:
             yield waiting

@@ -14,6 +14,7 @@ from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, S
 from scanloom.schemas.tiles import Piece
 from scanloom.schemas.trajectory import Poses
 from scanloom.stages.changes.objects import objects_of
+from scanloom.stages.changes.points import standing_points
 from scanloom.stages.changes.rays import fill, judge, new_image
 from scanloom.stages.changes.stage import Settings, changes
 from scanloom.stages.tiling import tiling
@@ -147,6 +148,20 @@ def test_a_map_that_extends_none_reads_nothing() -> None:
         Untouched([]),
     )
     assert len(table) == 0 and not table.sessions and not files.contents
+
+
+def test_ground_that_is_not_known_as_such_is_not_asked() -> None:
+    one = day(world(CAR, POLE), 0, count=4)
+    one.labels = [
+        ScanLabels(np.full(len(scan), PointClass.STATIC, np.uint8), scan.reference_ns, scan.scan_index)
+        for scan in one.scans
+    ]
+    asked = np.concatenate([standing_points(part.key, [part.product], 0.2, 0.3) for part in one.pieces()])
+    every = np.concatenate([standing_points(part.key, [part.product], 0.2, 0.0) for part in one.pieces()])
+    floor = GROUND_Z_M + 0.2
+    assert (every[:, 2] < floor).sum() > 1000 and not (asked[:, 2] < floor).any()
+    tall = every[:, 2] > GROUND_Z_M + 1.6
+    assert 0.5 * tall.sum() < (asked[:, 2] > GROUND_Z_M + 1.6).sum() <= tall.sum()
 
 
 def _says(point: Sequence[float], ray_to: Sequence[float], *, static: bool = True) -> tuple[int, int]:
