@@ -14,6 +14,9 @@ from scanloom.pipeline.run import Result
 from scanloom.schemas.errors import StageError
 from scanloom.schemas.scans import Scans
 from scanloom.stages.geometry.kernels import cache_folder, remember_signatures
+from scanloom.stages.loops.candidates import Candidate
+from scanloom.stages.loops.submaps import Submap
+from scanloom.stages.loops.verification import Drift, VerificationSettings, verify
 from scanloom.workflows.build_map import Order, build_map
 from scanloom.workflows.sessions import SAMPLE
 
@@ -43,8 +46,21 @@ def warm_kernels() -> None:
         folder = Path(scratch)
         sample = _map(SAMPLE, folder)
         _map(str(_bare_points(sample, folder / "bare")), folder)
+    _match()
     remember_signatures()
     (cache_folder() / MARKER).touch()
+
+
+def _match() -> None:
+    """Match a submap with itself: a drive of seconds meets no place twice."""
+    rng = np.random.default_rng(0)
+    along, height = rng.uniform(-20, 20, 6000), rng.uniform(-1.8, 6.0, 6000)
+    walls = np.column_stack((along, np.where(along > 3, 9.0, -7.0) + np.sin(along), height))
+    ground = np.column_stack((rng.uniform(-20, 20, (6000, 2)), np.full(6000, -1.8)))
+    points = np.concatenate((walls, ground, walls[:, [1, 0, 2]] + np.array([8.0, 0.0, 0.0])))
+    submap = Submap(points, points[:, 2] < -1.79, np.eye(4), -1.8, points)
+    candidate = Candidate(0, 0, 0, 1, float("nan"), float("nan"), np.eye(4), 0.0)
+    verify(VerificationSettings(), candidate, Drift(100.0), submap, submap)
 
 
 def _map(session: str, folder: Path) -> Result:

@@ -41,7 +41,9 @@ def pyramid(points: F8, low_m: float) -> U8:
     holds; first what holds points (n, 3), then that with all its neighbours."""
     grids = np.zeros((TOP_LEVEL + 1, CELLS, CELLS, 2), np.uint64)
     # A cell before the first may still cover what lies 2^k - 1 cells on: none does when the border is empty.
-    _occupy(np.ascontiguousarray(points), low_m, 1 << TOP_LEVEL, 1, grids[0, :, :, 0])
+    exact = np.zeros((CELLS, CELLS), np.uint64)
+    _occupy(np.ascontiguousarray(points), low_m, 1 << TOP_LEVEL, 1, exact)
+    grids[0, :, :, 0] = exact
     _widen(grids[0])
     for level in range(TOP_LEVEL):
         _pool(grids[level], grids[level + 1], 1 << level)
