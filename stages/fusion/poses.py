@@ -93,7 +93,7 @@ def _fused(
     factors = held(settings, factors, drives, old)
     before = whitened_norms(factors, nodes)
     try:
-        solution = solve(nodes, factors, settings.inlier_probability)
+        solution = solve(nodes, factors, settings.inlier_probability, settings.consistency)
     except StageError as error:
         lone = hanging_on_one(drives, found, known)
         if not lone:

@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from scanloom.stages.fusion.consistency import ConsistencySettings
 from scanloom.stages.fusion.gnss import GnssSettings
 
 
@@ -81,5 +82,9 @@ class Settings(BaseModel):
         ge=0,
         le=1,
         description="soft: stretches of the map that move by less stay as they are, and so do their tiles, m",
+    )
+    consistency: ConsistencySettings = Field(
+        default_factory=ConsistencySettings,
+        description="how loops must agree with each other and with the rest",
     )
     gnss: GnssSettings = Field(default_factory=GnssSettings, description="gates and weights of GNSS")
