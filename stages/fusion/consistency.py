@@ -80,10 +80,14 @@ class Chain:
         return np.concatenate(([0.0], np.cumsum(np.where(np.diff(self.part) == 0, step, 0.0))))
 
 
-def chain(n: int, i: I8, Z: F8, C: F8) -> Chain:
-    """Of motions Z (m, 4, 4) from nodes i to i + 1 with covariances C; those of the same motion are averaged."""
+def chain(n: int, i: I8, Z: F8, C: F8, weighing: F8 | None = None) -> Chain:
+    """Of motions Z (m, 4, 4) from nodes i to i + 1 with covariances C; those of the same motion are averaged.
+
+    `weighing` (m, 6, 6) are the covariances by which they are averaged, where C is only a part of them.
+    """
     order = np.argsort(i, kind="stable")
-    at, motion, covariance = _averaged(i[order], Z[order], C[order])
+    by = C if weighing is None else weighing
+    at, motion, covariance = _averaged(i[order], Z[order], C[order], by[order])
     part = np.cumsum(~np.isin(np.arange(n) - 1, at)) - 1
     step, spread = np.tile(np.eye(4), (n, 1, 1)), np.zeros((n, 6, 6))
     step[at + 1], spread[at + 1] = motion, covariance
@@ -92,17 +96,19 @@ def chain(n: int, i: I8, Z: F8, C: F8) -> Chain:
     return Chain(part, T, S)
 
 
-def _averaged(first: I8, Z: F8, C: F8) -> tuple[I8, F8, F8]:
-    """One motion from each node, weighted by information."""
+def _averaged(first: I8, Z: F8, C: F8, weighing: F8) -> tuple[I8, F8, F8]:
+    """One motion from each node, weighted by information W = weighing^-1: covariance P (sum W C W) P, P = (sum W)^-1."""
     at, start = np.unique(first, return_index=True)
     if len(at) == len(first):
         return at, Z, C
-    information = np.linalg.inv(C)
+    information = np.linalg.inv(weighing)
     apart = se3_log(inverse(Z[start][np.searchsorted(at, first)]) @ Z)
     whole = np.add.reduceat(information, start, axis=0)
     pull = np.add.reduceat(np.einsum("nij,nj->ni", information, apart), start, axis=0)
     mean = np.linalg.solve(whole, pull[..., None])[..., 0]
-    return at, Z[start] @ se3_exp(mean), np.linalg.inv(whole)
+    P = np.linalg.inv(whole)
+    spread = np.add.reduceat(information @ C @ information, start, axis=0)
+    return at, Z[start] @ se3_exp(mean), P @ spread @ P
 
 
 @dataclass(frozen=True)

@@ -282,7 +282,8 @@ class _Task:
         trusted[self.loops] = False
         rows = np.flatnonzero((s.shape == BETWEEN) & trusted & (s.j == s.i + 1))
         C = self.system.covariance_of(rows, stated)
-        return chain(len(self.nodes), s.i[rows], s.measurement[rows], C)
+        whole = self.system.covariance_of(rows, (1.0, 1.0)) if stated is not None else C
+        return chain(len(self.nodes), s.i[rows], s.measurement[rows], C, whole)
 
     def _rescale(self, T: F8) -> float:
         """Scales that loops in use show: of themselves, of what they share, and of odometry at their closures."""
