@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,12 +49,24 @@ from scanloom.stages.fusion.scales import (
 from scanloom.stages.fusion.system import System
 from scanloom.stages.geometry.se3 import F8
 
+
+class Effort(TypedDict):
+    """How far a solution is carried."""
+
+    iterations: int
+    tolerance: float
+
+
 ROUNDS = 10
 MOST_STEPS = 15
 REACH, LEAST_REACH_M = 1.5, 0.5
 """Loops are taken together up to this many times the least spread of the graph between their ends, m."""
 SETTLED = 0.03
 """Rounds end when no scale changes by more than this share."""
+TRIAL: Effort = {"iterations": 15, "tolerance": 1e-3}
+"""A graph whose loops are all true is near its optimum after fewer steps; one with false loops never is."""
+GROWING: Effort = {"iterations": 8, "tolerance": 1e-3}
+"""Between two steps of growth: the next one goes on from there."""
 CONTRADICTS_GRAPH = "switched off: contradicts the rest of the graph"
 
 
@@ -82,7 +95,9 @@ def solve(
     task = _Task(nodes, active, inlier_probability, consistency or ConsistencySettings())
     _determined(len(nodes), task.system)
     try:
-        T = task.solved()
+        T = task.without_loops()
+        task = task.of_possible_loops(T)
+        T = task.solved(T)
         covariance = task.system.covariances(T, task.weight).poses
     except FloatingPointError as error:
         raise StageError(
@@ -130,17 +145,35 @@ class _Task:
         self.group, self.scales = groups(factors), Scales.as_stated()
         self.weight = np.ones(len(factors))
         self.reason = np.full(len(factors), "", object)
-        self.impossible = np.zeros(len(self.loops), bool)
         self._known: tuple[tuple[F8, F8, Stack], F8] | None = None
 
-    def solved(self) -> F8:
-        """Poses at the optimum; without loops GNSS alone is doubted."""
-        loose = bool(len(self.loops))
+    def without_loops(self) -> F8:
+        """Poses at the optimum of all but loops, in which fixes are doubted."""
         self.weight[self.loops] = 0.0
-        T = graduated(self.system, self.nodes, self.weight, self.gnss, self.limit, loose=loose)
-        if not loose:
+        return graduated(
+            self.system, self.nodes, self.weight, self.gnss, self.limit, loose=bool(len(self.loops))
+        )
+
+    def of_possible_loops(self, T: F8) -> _Task:
+        """The task without those loops that the graph without loops, at its optimum T, does not allow by far.
+
+        They are refused once and for all: far jumps across the map would fill the system of equations.
+        """
+        square, _, _ = self._against_rest(T, self.settings.drift_factor)
+        impossible = self.loops[square > self.limit[self.loops]]
+        if not len(impossible):
+            return self
+        for k in impossible:
+            self.factors[k].weight, self.factors[k].verdict = 0.0, CONTRADICTS_REST
+        kept = np.delete(np.arange(len(self.factors)), impossible)
+        task = _Task(T, [self.factors[k] for k in kept], self.probability, self.settings)
+        task.weight = self.weight[kept]
+        return task
+
+    def solved(self, T: F8) -> F8:
+        """Poses at the optimum, from that without loops on."""
+        if not len(self.loops):
             return T
-        self._refuse_impossible(T)
         together = self._all_at_once(T)
         T = T if together is None else together
         for _ in range(ROUNDS):
@@ -163,19 +196,14 @@ class _Task:
     def _used(self) -> I8:
         return self.loops[self.weight[self.loops] > 0]
 
-    def _refuse_impossible(self, T: F8) -> None:
-        """Once and for all, at the optimum T of the graph without loops: those that it does not allow by far."""
-        square, _, _ = self._against_rest(T, self.settings.drift_factor)
-        self.impossible = square > self.limit[self.loops]
-
     def _all_at_once(self, T: F8) -> F8 | None:
         """The optimum with every loop that nothing speaks against, if all of them fit it and odometry is not bent."""
         found = self._agreement()
-        chosen = ~self.impossible & ~contradicting(len(self.loops), found.among(~self.impossible))
+        chosen = ~contradicting(len(self.loops), found)
         sure = self._against_rest(T, 1.0)[2]
         chosen &= sure | ~alone_among(len(self.loops), found.among(chosen), ~chosen)
         self.weight[self.loops[chosen]] = 1.0
-        trial = self.system.optimised(T, self.weight, loose=True)
+        trial = self.system.optimised(T, self.weight, loose=True, **TRIAL)
         square, s = self.system.squares(trial), self.system.stack
         bent = self.weight @ square > chi_square_limit(
             float((self.weight * s.freedom).sum()), self.probability
@@ -223,7 +251,7 @@ class _Task:
         """Which loops (m,) could come into use now, and the graph's spread between their ends, m."""
         used = self.weight[self.loops] > 0
         square, spread_m, sure = self._against_rest(T, factor)
-        allowed = (square <= self.limit[self.loops]) & ~self.impossible
+        allowed = square <= self.limit[self.loops]
         rivals = found.among(allowed | used)
         gone = contradicting(len(used), rivals)
         lonely = alone_among(len(used), rivals, gone)
@@ -234,17 +262,16 @@ class _Task:
         reason = np.full(len(self.loops), CONTRADICTS_GRAPH, object)
         reason[unconfirmed] = UNCONFIRMED
         reason[gone] = CONTRADICTS_LOOP
-        reason[self.impossible] = CONTRADICTS_REST
         self.reason[self.loops] = reason
 
     def _without_misfits(self, T: F8) -> F8:
         """Optimum of what is in use, after those loops left that do not fit it."""
-        T = self.system.optimised(T, self.weight, loose=True, tolerance=1e-5)
+        T = self.system.optimised(T, self.weight, loose=True, **GROWING)
         used = self._used()
         misfits = used[self.system.squares(T)[used] > self.limit[used]]
         if len(misfits):
             self.weight[misfits] = 0.0
-            T = self.system.optimised(T, self.weight, loose=True, tolerance=1e-5)
+            T = self.system.optimised(T, self.weight, loose=True, **GROWING)
         return T
 
     def _against_rest(self, T: F8, factor: float) -> tuple[F8, F8, NDArray[np.bool_]]:

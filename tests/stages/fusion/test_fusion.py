@@ -256,8 +256,12 @@ def test_two_sessions_share_a_map_through_loops() -> None:
     assert [p.key for p in out[:2]] == ["a", "b"]
     assert out[1].product.frame == "world"
     assert 0.01 < ate(in_truth_frame(out[1].product), other.T, align=False) < 0.25
-    with pytest.raises(StageError, match="session b"):
-        list(fusion(Settings(), sessions, tracks, NO_LOOPS, gnss, imu))
+    *kept, graph = fusion(Settings(), sessions, tracks, NO_LOOPS, gnss, imu)
+    assert [part.key for part in kept] == ["a"], "what nothing ties to a map that has a place is left out"
+    assert any("session b" in warning for warning in graph.warnings)
+    nowhere = parts(a=Gnss.empty(), b=Gnss.empty())
+    with pytest.raises(StageError, match="session"):
+        list(fusion(Settings(), sessions, tracks, NO_LOOPS, nowhere, imu))
 
 
 def test_same_input_same_bytes() -> None:
