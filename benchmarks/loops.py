@@ -44,7 +44,7 @@ def main(words: Sequence[str] | None = None) -> None:
         figures += _of_log(folder, options.store)
     if options.levels and everything:
         with console.status("matching at levels 1 to 5"):
-            figures += loop_levels.figures(everything)
+            figures += loop_levels.figures([(one, one) for one in everything])
     figures.append(
         Figure("bench.run.wall_s", time.monotonic() - started, "s", "run", "wall time of this benchmark")
     )
