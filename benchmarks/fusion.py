@@ -20,7 +20,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import bicocca, costs, outage
+from benchmarks import bicocca, city, costs, outage
 from benchmarks.scores import Figure
 
 STORE = Path("build/bench/store")
@@ -75,6 +75,10 @@ def _kitti(data: Path) -> Iterator[Figure]:
     yield from _if_there(data / "kitti_00_trajectory", lambda folder: module.figures(folder.parent))
 
 
+def _city(_: Path) -> Iterator[Figure]:
+    yield from city.figures()
+
+
 def _outage(_: Path) -> Iterator[Figure]:
     yield from outage.figures(STORE)
 
@@ -90,6 +94,7 @@ PARTS: dict[str, Callable[[Path], Iterator[Figure]]] = {
     "bicocca": _bicocca,
     "costs": _costs,
     "kitti": _kitti,
+    "city": _city,
     "outage": _outage,
 }
 

@@ -37,6 +37,7 @@ from scanloom.stages.fusion.drives import I8
 from scanloom.stages.fusion.factors import BETWEEN, POSITION, PRIOR, Factor
 from scanloom.stages.fusion.graduated import checked, graduated
 from scanloom.stages.fusion.linearization import Stack
+from scanloom.stages.fusion.reduction import Reduction, worthwhile
 from scanloom.stages.fusion.scales import (
     LOOP,
     LOWEST,
@@ -57,9 +58,11 @@ class Effort(TypedDict):
     tolerance: float
 
 
+MANY = 20_000
+"""Poses from which on loops are judged on the graph made short, where that halves it at least."""
 ROUNDS = 10
 MOST_STEPS = 15
-REACH, LEAST_REACH_M = 1.5, 0.5
+REACH, LEAST_REACH_M = 2.5, 0.5
 """Loops are taken together up to this many times the least spread of the graph between their ends, m."""
 SETTLED = 0.03
 """Rounds end when no scale changes by more than this share."""
@@ -174,6 +177,10 @@ class _Task:
         """Poses at the optimum, from that without loops on."""
         if not len(self.loops):
             return T
+        short = Reduction.of(self.system.stack, self._chain(), self.loops)
+        if worthwhile(len(T), short.kept, MANY):
+            T = self.system.optimised(self._judged_on(short, T), self.weight)
+            return checked(self.system, T, self.weight, np.concatenate((self._used(), self.gnss)), self.limit)
         together = self._all_at_once(T)
         T = T if together is None else together
         for _ in range(ROUNDS):
@@ -184,6 +191,18 @@ class _Task:
             if changed < SETTLED:
                 break
         return T
+
+    def _judged_on(self, short: Reduction, T: F8) -> F8:
+        """Which loops and fixes to use, and at what scales, as the short graph tells; poses spread from its optimum."""
+        task = _Task(T[short.kept], short.factors(self.factors), self.probability, self.settings)
+        rows, stretches = short.rows, len(task.factors) - len(short.rows)
+        task.weight[stretches:] = self.weight[rows]
+        solved = task.solved(T[short.kept])
+        self.weight[rows], self.reason[rows] = task.weight[stretches:], task.reason[stretches:]
+        self.scales, scale = task.scales, task.scales.of(self.group)
+        scale[rows] = task.system.scale[stretches:]
+        self.system.rescale(scale)
+        return short.spread(solved)
 
     def tell(self) -> None:
         """Weights and verdicts into the factors."""
