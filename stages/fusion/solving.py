@@ -169,7 +169,7 @@ class _Task:
         for k in impossible:
             self.factors[k].weight, self.factors[k].verdict = 0.0, CONTRADICTS_REST
         kept = np.delete(np.arange(len(self.factors)), impossible)
-        task = _Task(T, [self.factors[k] for k in kept], self.probability, self.settings)
+        task = _Task(T, [self.factors[int(k)] for k in kept], self.probability, self.settings)
         task.weight = self.weight[kept]
         return task
 

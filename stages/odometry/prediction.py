@@ -10,8 +10,8 @@ from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.stages.geometry.motion import MotionTrack
 from scanloom.stages.geometry.se3 import F8, inverse, se3_exp, se3_log
-from scanloom.stages.odometry.slip import SlipGate
 from scanloom.stages.geometry.traction import WheelScale, without_slips
+from scanloom.stages.odometry.slip import SlipGate
 
 GYRO_STD_RAD_PER_SQRT_S = 0.002
 WHEEL_STD_SHARE = 0.02

@@ -91,7 +91,9 @@ def test_a_room_is_found_where_it_is(yaw_deg: float, reach_deg: float) -> None:
 
 def test_peaks_are_distinct_sorted_and_the_same_every_time() -> None:
     rng = np.random.default_rng(5)
-    row = np.concatenate([room(rng, 500) * 0.1 + np.array([x, y, 0]) for x in range(-30, 31, 5) for y in (-8, 8)])
+    row = np.concatenate(
+        [room(rng, 500) * 0.1 + np.array([x, y, 0]) for x in range(-30, 31, 5) for y in (-8, 8)]
+    )
     grid, prior = pyramid(row, LOW_M), Prior(0, 0, 0, 0, 10, 2, np.radians(10))
     found = peaks(grid, LOW_M, row, prior, 10, 0.3, 0.1)
     again = peaks(grid, LOW_M, row, prior, 10, 0.3, 0.1)
@@ -112,7 +114,9 @@ def test_nothing_to_compare_gives_no_peak() -> None:
     none = np.zeros((0, 3))
     assert peaks(pyramid(none, LOW_M), LOW_M, room(rng), prior, 10, 0.6, 0.3) == []
     assert peaks(pyramid(room(rng), LOW_M), LOW_M, none, prior, 10, 0.6, 0.3) == []
-    assert peaks(pyramid(room(rng), LOW_M), LOW_M, room(rng) + np.array([0, 0, 500]), prior, 10, 0.6, 0.3) == []
+    assert (
+        peaks(pyramid(room(rng), LOW_M), LOW_M, room(rng) + np.array([0, 0, 500]), prior, 10, 0.6, 0.3) == []
+    )
 
 
 def test_one_point_fits_where_a_point_is() -> None:
