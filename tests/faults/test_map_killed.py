@@ -14,7 +14,8 @@ import pytest
 
 from tests.logs import scan_folder
 
-VARIES = {"metrics.json", "report.html"}
+VARIES = {"metrics.json", "report.html", "sources.json"}
+"""Times of the run, and places on this machine."""
 """They name times and memory of the run."""
 
 
