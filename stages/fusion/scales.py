@@ -30,7 +30,8 @@ BELIEF = 30.0
 """Redundancy at which residuals of loops weigh as much as the statement."""
 BELIEF_CLOSURES = 6.0
 """Directions closed at which closures weigh as much as the statement of odometry."""
-LOWEST, HIGHEST = 0.5, 3.0
+LOWEST, LOWEST_BESIDE_FIXES, HIGHEST = 0.5, 1.0, 3.0
+"""Where fixes are in use they tell how good odometry is (see `walk`), and loops, whose errors are much alike, not even better."""
 HALVES = slice(0, 3), slice(3, 6)
 TAIL = 4.0
 """Degrees of freedom of the closures' distribution (Student): a loop that is itself off must not decide."""
@@ -83,7 +84,7 @@ def of_loops(system: System, T: F8, weight: F8, loops: I8, now: F8) -> F8:
         told = clear[:, block]
         squares = (residual[:, block] ** 2)[told].sum()
         new[half] = np.sqrt((squares + BELIEF) / (redundancy[:, block][told].sum() + BELIEF))
-    return np.clip(new, LOWEST, HIGHEST)
+    return np.asarray(np.clip(new, None, HIGHEST))
 
 
 def shared(residual: F8, pairs: I8, beside: F8) -> F8:

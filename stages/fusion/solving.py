@@ -41,6 +41,7 @@ from scanloom.stages.fusion.reduction import Reduction, worthwhile
 from scanloom.stages.fusion.scales import (
     LOOP,
     LOWEST,
+    LOWEST_BESIDE_FIXES,
     Scales,
     groups,
     of_loops,
@@ -336,17 +337,19 @@ class _Task:
         used = self._used()
         if not len(used):
             return 0.0
+        lowest = LOWEST_BESIDE_FIXES if self.weight[self.gnss].any() else LOWEST
         loops = self.system.stated.taken(used)
         loop = of_loops(self.system, T, self.weight, self.loops, self.scales.value[LOOP])
+        loop = np.maximum(loop, lowest)
         chains = [self._chain(half) for half in ((1.0, 1.0), (1.0, 0.0), (0.0, 1.0))]
         found = closures(chains, loops, self.system.covariance_of(used))
         odometry = of_odometry(found.error, found.C, found.ways, found.freedom, found.share)
-        bounded = np.maximum(odometry, LOWEST)
+        bounded = np.maximum(odometry, lowest)
         new = Scales(np.array([bounded, loop]), odometry / bounded)
         change = new.change(self.scales)
         scale = new.of(self.group)
         pairs, beside = side_by_side(chains[0], loops, SAME_SIGHT_M)
-        scale[used] = np.clip(scale[used] * shared(loops.residuals(T), pairs, beside), LOWEST, None)
+        scale[used] = np.clip(scale[used] * shared(loops.residuals(T), pairs, beside), lowest, None)
         self.scales = new
         self.system.rescale(scale)
         return change
