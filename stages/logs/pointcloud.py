@@ -38,6 +38,8 @@ SHORTEST_SWEEP_NS, LONGEST_SWEEP_NS = 4e6, 2e9
 """Spans of point times within one cloud that a sensor can have; they tell the unit of a time field."""
 OWN_CLOCK_NS = 5_000_000_000
 """Points further from their header than this carry another clock."""
+LONGEST_POINT = 2**31 - 1
+"""Bytes of a point that numpy can stride over."""
 BEAM_COUNTS = (4, 6, 8, 16, 32, 40, 64, 80, 128, 192, 256)
 
 
@@ -142,6 +144,8 @@ def _view(message: PointCloud2) -> tuple[NDArray[Any], list[str]]:
     """The message's bytes as a structured array (n,), a view where rows follow each other without padding."""
     remarks = []
     height, width, step, row = message.height, message.width, message.point_step, message.row_step
+    if step > LONGEST_POINT:
+        raise InvalidInput(f"point_step is {step} bytes, more than any point has")
     dtype = _dtype(message.fields, step, message.is_bigendian)
     used = width * step
     if height > 1 and row < used:

@@ -247,12 +247,19 @@ def test_an_empty_cloud() -> None:
         ({"fields": (PointField("x", 0, 17, 1),)}, "unknown datatype 17"),
         ({"fields": (PointField("x", 10, 7, 1),)}, "past point_step"),
         ({"fields": ()}, "no fields"),
+        ({"height": 0, "point_step": 2**31}, "point_step is 2147483648"),
     ],
 )
 def test_impossible_layouts_are_refused_by_name(change: dict[str, object], words: str) -> None:
     good = message(xyz(spin()))
     with pytest.raises(InvalidInput, match=words):
         decode_pointcloud2(PointCloud2(**{**vars(good), **change}))  # type: ignore[arg-type]
+
+
+def test_the_longest_point_there_can_be_is_no_error_of_its_own() -> None:
+    good = message(xyz(spin()))
+    cloud = decode_pointcloud2(PointCloud2(**{**vars(good), "height": 0, "point_step": 2**31 - 1}))
+    assert len(cloud.x_m) == 0
 
 
 def test_one_row_with_a_careless_row_step_is_read_and_said() -> None:
