@@ -32,7 +32,7 @@ from scanloom.stages.fusion.gravity import gravity
 from scanloom.stages.fusion.links import links
 from scanloom.stages.fusion.placing import place_by_gnss, placed
 from scanloom.stages.fusion.settings import Settings
-from scanloom.stages.fusion.solving import marginals, solve
+from scanloom.stages.fusion.solving import solve
 from scanloom.stages.fusion.spreading import poses_of
 from scanloom.stages.fusion.tuning import tuned
 from scanloom.stages.fusion.untied import ONE_LOOP, Untied, hanging_on_one, left_out, loops_among, those_tied
@@ -99,9 +99,8 @@ def _fused(
         if not lone:
             raise
         raise Untied.of(lone, anywhere=bool(origin or old), loops=ONE_LOOP) from error
-    covariance = marginals(solution)
     for name, segments in groupby(drives, key=lambda d: d.name):
-        solved = Poses.concatenate([poses_of(d, solution, covariance, origin) for d in segments])
+        solved = Poses.concatenate([poses_of(d, solution, origin) for d in segments])
         yield Part(final(settings, name, solved, old), name)
     warnings = [*warned, *refusals(drives, fixes), *guessed(drives, gaps, found, fixes)]
     warnings += on_ties(drives, fixes, factors, old)

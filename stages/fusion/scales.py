@@ -25,7 +25,7 @@ from scanloom.stages.fusion.system import System
 from scanloom.stages.geometry.se3 import F8
 
 GROUPS = ("odometry", "loop")
-ODOMETRY, LOOP = range(2)
+LOOP = GROUPS.index("loop")
 BELIEF = 30.0
 """Redundancy at which residuals of loops weigh as much as the statement."""
 BELIEF_CLOSURES = 6.0

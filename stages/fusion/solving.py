@@ -112,11 +112,6 @@ def solve(
     return Solution(T, covariance, task.scales)
 
 
-def marginals(solution: Solution) -> F8:
-    """Marginal covariances (n, 6, 6), order (rotation, translation), right tangent."""
-    return solution.covariance
-
-
 def interpolate_covariances(at: I8, covariance: F8, wanted: I8) -> F8:
     """Covariances (m, 6, 6) at `wanted` (m,) between those at increasing `at` (n,); the end value is kept outside."""
     if len(at) == 1:

@@ -11,7 +11,7 @@ from scanloom.stages.fusion.solving import Solution, interpolate_covariances
 from scanloom.stages.geometry.se3 import F8, inverse, se3_exp, se3_log
 
 
-def poses_of(d: Drive, solution: Solution, covariance: F8, origin: Georeference | None) -> Poses:
+def poses_of(d: Drive, solution: Solution, origin: Georeference | None) -> Poses:
     """Poses of all scans: odometry from the keyframe before, plus its share of the correction up to the next one."""
     rows = d.keyframes
     keyframe = np.zeros(len(d.odometry), bool)
@@ -21,7 +21,7 @@ def poses_of(d: Drive, solution: Solution, covariance: F8, origin: Georeference 
         stamp_ns=d.odometry.stamp_ns.copy(),
         T_world_lidar=_spread(d, solution.T[d.nodes]),
         covariance=interpolate_covariances(
-            d.odometry.stamp_ns[rows], covariance[d.nodes], d.odometry.stamp_ns
+            d.odometry.stamp_ns[rows], solution.covariance[d.nodes], d.odometry.stamp_ns
         ),
         keyframe=keyframe,
         frame=WORLD if origin else MAP,
