@@ -43,6 +43,14 @@ def test_what_is_kept_comes_back_and_stretches_keep_their_shape() -> None:
     assert np.array_equal(short.kept, ends)
     assert len(short.factors(factors)) == len(short.kept) - 1 + len(loops) + 1
     np.testing.assert_allclose(short.spread(nodes[short.kept]), nodes, atol=1e-6)
+    longest = int(np.argmax(np.diff(short.kept)))
+    moved = nodes[short.kept].copy()
+    moved[longest + 1 :, 0, 3] += 1.0
+    off = np.linalg.norm((short.spread(moved) - nodes)[:, :3, 3], axis=1)
+    a, b = short.kept[longest : longest + 2]
+    step = np.diff(off[a : b + 1])
+    assert 0.5 / (b - a) < step.min()
+    assert step.max() < 2.0 / (b - a), "what a stretch lacks is shared out evenly"
 
 
 def test_short_and_dense_graphs_stay_whole() -> None:
