@@ -23,6 +23,8 @@ class PointClass(IntEnum):
     EGO = 5
     OUTLIER = 6
     OUT_OF_RANGE = 7
+    CHANGED = 8
+    """Stood while one session passed and was gone when another did."""
 
 
 class Cloud:

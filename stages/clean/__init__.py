@@ -1,0 +1,1 @@
+"""Clean: what the finished map says was seen through."""

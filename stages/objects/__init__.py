@@ -1,0 +1,1 @@
+"""Objects: vehicles found in the scans and followed."""
