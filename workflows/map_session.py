@@ -44,7 +44,7 @@ NODES: tuple[Node, ...] = (
     node("ingest",     ingest,     per="session", reads=(RawLog,),                             writes=(Scans, Imu, Gnss, Wheel, Session)),
     node("sensors",    sensors,    per="session", reads=(Scans, Session, Imu, Wheel),          writes=SensorCheck),
     node("deskew",     deskew,     per="chunk",   reads=(Scans, Session, Imu, Wheel, SensorCheck), writes=Deskewed),
-    node("denoise",    denoise,    per="chunk",   reads=(Deskewed, Session),                   writes=Labels),
+    node("denoise",    denoise,    per="chunk",   reads=(Deskewed, Session, Imu, Wheel, SensorCheck), writes=Labels),
     node("windows",    windows,    per="session", reads=(Scans,),                              writes=Window, settings="odometry"),
     node("track",      track,      per="window",  reads=(Window, Deskewed, Labels, Session, Imu, Wheel, SensorCheck), writes=(Track, TrackEnds), settings="odometry"),
     node("odometry",   odometry,   per="session", reads=(Deskewed, Labels, Session, Imu, Wheel, SensorCheck, Track, TrackEnds), writes=Odometry),

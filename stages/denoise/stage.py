@@ -1,6 +1,7 @@
 """Denoise: a class for every point. Nothing is deleted here; what is not scenery is named.
 
-Own vehicle, out of range, standing alone, ground; the rest is static until a later stage knows better.
+Own vehicle, out of range, standing alone, ground; then, by the scans shortly before and after, what is in the air; the
+rest is static until a later stage knows better.
 Source: methods 1.5 (Ren et al. 2021, steps c and d) and 2.3.1 for the ground.
 """
 
@@ -11,36 +12,63 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
 from scanloom.schemas.session import Session
+from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.stages.denoise.bounds import bounded
 from scanloom.stages.denoise.settings import Settings
+from scanloom.stages.denoise.window import Moment, View, moments
 from scanloom.stages.geometry.ground import ground_mask
 from scanloom.stages.geometry.isolation import isolated
+from scanloom.stages.geometry.motion import MotionTrack
+from scanloom.stages.geometry.range_image import ImageSettings, range_image
+from scanloom.stages.geometry.rig import corrected
 from scanloom.stages.geometry.se3 import F8
 
-VERSION = 1
+VERSION = 2
 
 U1 = NDArray[np.uint8]
 
 USUAL_BEAMS = 32
 FINEST_STEP_RAD, COARSEST_STEP_RAD = 0.001, 0.02
+REACH = 8
+IMAGE = ImageSettings(rows=128, columns=2048)
 
 
-def denoise(settings: Settings, deskewed: Deskewed, session: Session) -> Labels:
-    """A `PointClass` for every point of every scan of a chunk, scan by scan, in the order of the points."""
+def denoise(
+    settings: Settings,
+    deskewed: Deskewed,
+    session: Session,
+    imu: Imu,
+    wheel: Wheel,
+    check: SensorCheck | None = None,
+) -> Labels:
+    """A `PointClass` for every point of every scan of a chunk, scan by scan, in the order of the points.
+
+    A few scans before and after the present one are held. `check` corrects IMU and wheels first.
+    """
     T_base_lidar = np.array(session.T_base("lidar"), float)
-    return Labels(_labelled(settings, deskewed, T_base_lidar, session.beams))
+    track = MotionTrack.build(*corrected(imu, wheel, check), session)
+    views = (view(settings, scan, T_base_lidar, session.beams) for scan in deskewed)
+    return Labels(_labelled(settings, moments(views, track, REACH)))
 
 
-def _labelled(settings: Settings, deskewed: Deskewed, T_base_lidar: F8, beams: int) -> Iterator[ScanLabels]:
-    for scan in deskewed:
-        classes = classify(settings, scan, T_base_lidar, beams)
+def _labelled(settings: Settings, around: Iterator[Moment]) -> Iterator[ScanLabels]:
+    for moment in around:
+        scan, classes = moment.view.scan, moment.view.classes
         yield ScanLabels(class_=classes, reference_ns=scan.reference_ns, scan_index=scan.scan_index)
 
 
+def view(settings: Settings, scan: DeskewedScan, T_base_lidar: F8, beams: int) -> View:
+    """What the scan alone tells: classes and range image."""
+    classes = classify(settings, scan, T_base_lidar, beams)
+    seen = (classes != PointClass.EGO) & (classes != PointClass.OUT_OF_RANGE)
+    return View(scan, classes, range_image(IMAGE, scan.x_m, scan.y_m, scan.z_m, seen, seen))
+
+
 def classify(settings: Settings, scan: DeskewedScan, T_base_lidar: F8, beams: int) -> U1:
-    """Classes (n,) of the points of one scan; `beams` of the sensor, 0 when unknown."""
+    """Classes (n,) of the points of one scan by itself; `beams` of the sensor, 0 when unknown."""
     x, y, z = scan.x_m, scan.y_m, scan.z_m
     classes = bounded(
         x, y, z, T_base_lidar, np.array(settings.ego_low_m), np.array(settings.ego_high_m),

@@ -17,7 +17,7 @@ from scanloom.schemas.loops import Places
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
 from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.geometry.lookahead import ahead
-from scanloom.stages.loops.range_image import ImageSettings, range_image
+from scanloom.stages.geometry.range_image import ImageSettings, range_image
 from scanloom.stages.loops.reading import keyframe_scans
 from scanloom.stages.loops.scan_context import F4, RINGS, SECTORS, scan_contexts
 from scanloom.stages.loops.segmentation import SegmentationSettings, segments

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.voxels import Int
-from scanloom.stages.loops.range_image import turn_of
+from scanloom.stages.geometry.range_image import turn_of
 
 F4 = NDArray[np.float32]
 I2 = NDArray[np.int16]

@@ -68,7 +68,7 @@ def test_a_real_street_is_deskewed_and_labelled(shared_data: Path) -> None:
     flat = [*iter(deskew(Settings(), Scans(scans), session(), Imu.empty(), Wheel.empty()))]
     moved = np.linalg.norm(flat[0].points() - scans[0].points(), axis=1)
     assert 0.1 < moved.max() < 1.0  # 4 m/s over half a sweep is 0.2 m
-    for labels in iter(denoise(DenoiseSettings(), Deskewed(flat), session())):
+    for labels in iter(denoise(DenoiseSettings(), Deskewed(flat), session(), Imu.empty(), Wheel.empty())):
         share = np.bincount(labels.class_, minlength=8) / len(labels)
         assert 0.4 < share[PointClass.GROUND] < 0.75
         assert share[PointClass.OUTLIER] < 0.03

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scanloom.stages.loops.range_image import ImageSettings, RangeImage, range_image
+from scanloom.stages.geometry.range_image import BINS, ImageSettings, RangeImage, range_image
 from scanloom.stages.loops.segmentation import SegmentationSettings, belong_together, calibrated, segments
 from tests.stages.loops.worlds import START_NS
 from tests.worlds import BoxWorld, observe
@@ -13,6 +13,7 @@ from tests.worlds import BoxWorld, observe
 F4 = np.ndarray
 STEP = np.radians(0.2)
 COLUMNS = 360
+NO_ROWS = np.zeros(BINS, np.int32)
 
 
 def image_of(ranges: F4, elevation_deg: F4 | None = None) -> tuple[RangeImage, F4]:
@@ -26,7 +27,7 @@ def image_of(ranges: F4, elevation_deg: F4 | None = None) -> tuple[RangeImage, F
     up = np.broadcast_to(elevation[:, None], ranges.shape)
     direction = np.stack((np.cos(up) * np.cos(azimuth), np.cos(up) * np.sin(azimuth), np.sin(up)), axis=-1)
     xyz = (direction * ranges[..., None])[filled].astype(np.float32)
-    return RangeImage(point, ranges.astype(np.float32), elevation, 2 * np.pi / columns), xyz
+    return RangeImage(point, ranges.astype(np.float32), elevation, 2 * np.pi / columns, NO_ROWS), xyz
 
 
 def labels_of_ranges(ranges: F4, intensity: float | F4 = np.nan, **settings: object) -> F4:

@@ -11,11 +11,14 @@ from numpy.typing import NDArray
 
 from scanloom.schemas.scans import Deskewed, DeskewedScan, PointClass
 from scanloom.schemas.session import Extrinsic, Session
+from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.stages.denoise import Settings, azimuth_step_rad, denoise
+from scanloom.stages.denoise.stage import REACH
 from scanloom.stages.geometry.se3 import F8, pose, so3_exp, transform
 from tests.worlds import GROUND_Z_M, BoxWorld, observe, street
 
 SETTINGS = Settings()
+SILENT = Imu.empty(), Wheel.empty()
 LEFT_OUT = (PointClass.EGO, PointClass.OUTLIER, PointClass.OUT_OF_RANGE)
 
 
@@ -29,7 +32,7 @@ def make_session(beams: int = 16, T_base_lidar: F8 | None = None) -> Session:
 
 
 def labels_of(scan: DeskewedScan, session: Session, settings: Settings = SETTINGS) -> NDArray[np.uint8]:
-    (labels,) = iter(denoise(settings, Deskewed([scan]), session))
+    (labels,) = iter(denoise(settings, Deskewed([scan]), session, *SILENT))
     assert len(labels) == len(scan)
     assert (labels.reference_ns, labels.scan_index) == (scan.reference_ns, scan.scan_index)
     return labels.class_
@@ -184,11 +187,11 @@ def test_empty_and_tiny_scans_pass() -> None:
     scan = observe(street(0), np.eye(4), rng=np.random.default_rng(1))
     assert len(labels_of(scan.take(slice(0, 0)), make_session())) == 0
     assert len(labels_of(scan.take(slice(0, 3)), make_session(0))) == 3
-    assert [*iter(denoise(SETTINGS, Deskewed([]), make_session()))] == []
+    assert [*iter(denoise(SETTINGS, Deskewed([]), make_session(), *SILENT))] == []
 
 
 def test_labels_stream_and_the_same_input_gives_the_same_bytes() -> None:
-    scans = [observe(street(0), np.eye(4), index=i, rng=np.random.default_rng(i)) for i in range(3)]
+    scans = [observe(street(0), np.eye(4), index=i, rng=np.random.default_rng(i)) for i in range(12)]
     before = [scan.points().tobytes() for scan in scans]
     taken = 0
 
@@ -198,12 +201,12 @@ def test_labels_stream_and_the_same_input_gives_the_same_bytes() -> None:
             taken += 1
             yield scan
 
-    stream = iter(denoise(SETTINGS, Deskewed(feed()), make_session()))
+    stream = iter(denoise(SETTINGS, Deskewed(feed()), make_session(), *SILENT))
     first = [next(stream)]
-    assert taken == 1
+    assert taken == REACH + 1
     first += [*stream]
-    again = [labels_of(scan, make_session()) for scan in scans]
-    assert [labels.class_.tobytes() for labels in first] == [a.tobytes() for a in again]
+    again = [*iter(denoise(SETTINGS, Deskewed(scans), make_session(), *SILENT))]
+    assert [labels.class_.tobytes() for labels in first] == [a.class_.tobytes() for a in again]
     assert before == [scan.points().tobytes() for scan in scans]
 
 

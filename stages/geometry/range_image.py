@@ -74,6 +74,8 @@ class RangeImage:
     """(rows,) elevation of the middle of each row."""
     column_rad: float
     """Azimuth between columns."""
+    row_of_bin: I4
+    """(BINS,) row of each bin of elevation, for `cell_of`."""
 
 
 def range_image(settings: ImageSettings, x_m: F4, y_m: F4, z_m: F4, seen: B1, drawn: B1) -> RangeImage:
@@ -91,7 +93,7 @@ def range_image(settings: ImageSettings, x_m: F4, y_m: F4, z_m: F4, seen: B1, dr
     row = np.repeat(np.arange(len(first), dtype=np.int32), np.diff(ends))
     point, ranges = np.full((len(first), columns), -1, np.int32), np.zeros((len(first), columns), np.float32)
     _draw(x_m, y_m, z_m, drawn, elevation, row, point, ranges)
-    return RangeImage(point, ranges, middle, TAU / columns)
+    return RangeImage(point, ranges, middle, TAU / columns, row)
 
 
 def _first_bins(settings: ImageSettings, counts: I8, still: I8) -> I8:
@@ -139,8 +141,7 @@ def _elevations(x: F4, y: F4, z: F4, seen: B1) -> tuple[I2, I8, I8]:
         square = x[n] * x[n] + y[n] * y[n]
         if not seen[n] or not 0.0 < square + abs(z[n]) < np.inf:
             continue
-        up = turn_of(np.sqrt(square), z[n])
-        k = min(int((up + QUARTER if up < HALF else up - HALF - QUARTER) * BINS_PER_TURN), BINS - 1)
+        k = elevation_bin(np.sqrt(square), z[n])
         out[n] = k
         counts[k] += 1
         still[k] += abs(z[n]) < STILL_PER_M * square
@@ -177,6 +178,13 @@ def _draw(x: F4, y: F4, z: F4, drawn: B1, elevation: I2, row: I4, point: I4, ran
         r = np.sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n])
         if point[v, u] < 0 or r < ranges[v, u]:
             point[v, u], ranges[v, u] = n, r
+
+
+@kernel
+def elevation_bin(level: float, z: float) -> int:
+    """Bin of elevation of a point `level` m away on the level and `z` m up."""
+    up = turn_of(level, z)
+    return min(int((up + QUARTER if up < HALF else up - HALF - QUARTER) * BINS_PER_TURN), BINS - 1)
 
 
 @kernel
