@@ -113,9 +113,13 @@ class TrueLabels(Table):
     """What every point of one simulated scan truly is, in the order of the message; for evaluation and tests only."""
 
     NAME: ClassVar[str] = "true_labels"
+    SCHEMA_VERSION: ClassVar[int] = 2
 
     class_: NDArray[np.uint8] = column("u1", "a value of PointClass")
     instance: NDArray[np.uint16] = column("u2", "number of the object, 0 for none")
+    material: NDArray[np.uint8] = column(
+        "u1", "what it is made of, a value of the simulator's Material: leaves, bark and grass are vegetation"
+    )
     scan_index: int = attribute("number of the scan in its session, from 0")
 
 
@@ -123,4 +127,5 @@ class TruePoints(Stream[TrueLabels]):
     """The true labels of a simulated session."""
 
     NAME = "true_points"
+    SCHEMA_VERSION = 2
     ITEM = TrueLabels

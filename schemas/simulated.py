@@ -53,3 +53,29 @@ class TrueObjects(Table):
     length_m: NDArray[np.float64] = column("f8", "size along its own x", unit="m")
     width_m: NDArray[np.float64] = column("f8", "size along its own y", unit="m")
     height_m: NDArray[np.float64] = column("f8", "size upwards from the ground", unit="m")
+
+
+@dataclass(frozen=True)
+class TrueTracks(Table):
+    """One row per scan and object that moves at some time of the drive: its box in the middle of the sweep.
+
+    An object that comes to rest for good is listed on, with a `class_` of its own from then on.
+    """
+
+    NAME: ClassVar[str] = "true_tracks"
+
+    scan_index: NDArray[np.int64] = column("i8", "number of the scan in its session, from 0")
+    instance: NDArray[np.uint16] = column("u2", "its number in `true_points`")
+    what: NDArray[np.object_] = column("str", "`car`, `truck`, `bus`, `cyclist`, `person`, `dog` or `pram`")
+    class_: NDArray[np.uint8] = column(
+        "u1", "a value of PointClass: DYNAMIC, or STATIC once it stands for good"
+    )
+    points: NDArray[np.uint32] = column("u4", "returns of the scan that are from it")
+    x_m: NDArray[np.float64] = column("f8", "middle of its box, east", unit="m", frame="truth")
+    y_m: NDArray[np.float64] = column("f8", "middle of its box, north", unit="m", frame="truth")
+    z_m: NDArray[np.float64] = column("f8", "middle of its box, up", unit="m", frame="truth")
+    yaw_rad: NDArray[np.float64] = column("f8", "direction of its length, forward, from east", unit="rad")
+    length_m: NDArray[np.float64] = column("f8", "size along its own x", unit="m")
+    width_m: NDArray[np.float64] = column("f8", "size along its own y", unit="m")
+    height_m: NDArray[np.float64] = column("f8", "size upwards from the ground", unit="m")
+    speed_m_s: NDArray[np.float64] = column("f8", "speed over ground", unit="m/s")

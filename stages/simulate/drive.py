@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import IO
 
 import numpy as np
@@ -19,10 +19,11 @@ from scanloom.stages.simulate.rig import T_BASE
 from scanloom.stages.simulate.route import build_path, ring
 from scanloom.stages.simulate.settings import Settings
 from scanloom.stages.simulate.sweeping import Lidar, Sweep, scene_of
-from scanloom.stages.simulate.town import Thing, Town, build_town
+from scanloom.stages.simulate.town import Town, build_town
 from scanloom.stages.simulate.tracks import imu_track, wheel_track
-from scanloom.stages.simulate.traffic import build_traffic
-from scanloom.stages.simulate.truths import true_fixes, true_objects
+from scanloom.stages.simulate.traffic import Mover, build_traffic
+from scanloom.stages.simulate.truths import true_fixes, true_objects, true_tracks
+from scanloom.stages.simulate.weather import build_weather
 
 SETTLED = "simulated: exact"
 
@@ -33,17 +34,19 @@ class Drive:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self._recorder = Recorder()
-        self._labels: list[tuple[bytes, bytes]] = []
+        self._labels: list[list[bytes]] = []
         self._motion: Motion | None = None
         self._gnss: GnssTrack | None = None
-        self._things: list[Thing] = []
+        self._town_driven: Town | None = None
+        self._movers: Sequence[Mover] = ()
 
     def write_log(self, stream: IO[bytes]) -> None:
         s = self.settings
         town = self._town()
         path = town.path
         motion = build_motion(s, path)
-        lidar = Lidar(s, town, motion, build_traffic(s, path, motion))
+        movers = build_traffic(s, path, motion)
+        lidar = Lidar(s, town, motion, movers, build_weather(s, path, motion, movers))
         gnss_settings = s if s.gnss else s.model_copy(update={"duration_s": 0.0})
         gnss = gnss_track(gnss_settings, motion, scene_of(town.triangles()[0]))
         sweeps = self._noting_truth(lidar.sweeps())
@@ -52,7 +55,7 @@ class Drive:
         self._recorder.record(
             stream, entries(start_ns, sweeps, imu_track(s, motion), wheel_track(s, motion), gnss, frames)
         )
-        self._motion, self._gnss, self._things = motion, gnss, town.things
+        self._motion, self._gnss, self._town_driven, self._movers = motion, gnss, town, movers
 
     def _town(self) -> Town:
         """The world with the path that is driven in it."""
@@ -85,7 +88,15 @@ class Drive:
 
     def write_objects(self, stream: IO[bytes]) -> None:
         self._driven()
-        true_objects(self._things).write_to(stream)
+        assert self._town_driven is not None  # noqa: S101  (write_log sets it)
+        true_objects(self._town_driven.things).write_to(stream)
+
+    def write_tracks(self, stream: IO[bytes]) -> None:
+        self._driven()
+        town = self._town_driven
+        assert town is not None  # noqa: S101  (write_log sets it)
+        seen = [label.instance for label in self._true_labels()]
+        true_tracks(self.settings, town.path, self._movers, town.instances, seen).write_to(stream)
 
     def _driven(self) -> Motion:
         """The motion, after the log was written."""
@@ -99,15 +110,15 @@ class Drive:
     def _noting_truth(self, sweeps: Iterator[Sweep]) -> Iterator[Sweep]:
         self._labels = []
         for sweep in sweeps:
-            self._labels.append(
-                (zlib.compress(sweep.kind.tobytes(), 1), zlib.compress(sweep.instance.tobytes(), 1))
-            )
+            truth = (sweep.kind, sweep.instance, sweep.material)
+            self._labels.append([zlib.compress(column.tobytes(), 1) for column in truth])
             yield sweep
 
     def _true_labels(self) -> Iterator[TrueLabels]:
-        for index, (kind, instance) in enumerate(self._labels):
+        for index, (kind, instance, material) in enumerate(self._labels):
             yield TrueLabels(
                 np.frombuffer(zlib.decompress(kind), np.uint8),
                 np.frombuffer(zlib.decompress(instance), np.uint16),
+                np.frombuffer(zlib.decompress(material), np.uint8),
                 scan_index=index,
             )

@@ -33,6 +33,8 @@ class Material(IntEnum):
     METAL = 15
     RETRO = 16
     DUST = 17
+    SNOW = 18
+    WATER = 19
 
 
 REFLECTIVITY = np.array(
@@ -54,6 +56,8 @@ REFLECTIVITY = np.array(
         0.35,
         0.4,
         4.0,
+        0.12,
+        0.9,
         0.12,
     ],
     np.float32,

@@ -8,6 +8,11 @@ from scanloom.stages.geometry.se3 import F8, pose
 from scanloom.stages.simulate.meshes import Material, Mesh, box, cylinder, joined
 from scanloom.stages.simulate.motion import rotations
 
+MIN_RANGE_M = 0.4
+"""Nearer returns the LiDAR does not report."""
+WEAKEST = 1.2e-5
+"""Received power, reflectivity over range squared, of which half the returns are lost."""
+
 
 def _mount(xyz: tuple[float, float, float], rpy_deg: tuple[float, float, float]) -> F8:
     roll, pitch, yaw = (np.radians([angle]) for angle in rpy_deg)

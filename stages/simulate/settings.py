@@ -53,6 +53,24 @@ class Settings(BaseModel):
     dust_per_m: float = Field(
         0.25, ge=0.0, le=5.0, description="extinction of fresh dust behind the truck, 1/m"
     )
+    snow_per_m: float = Field(
+        0.0,
+        ge=0.0,
+        le=0.5,
+        description="snowfall: chance of a return from a flake in a metre of ray, at the range where flakes are seen best, 1/m; 0.0006 is light (0.5 % of the returns in streets, 1 % in the open), 0.0035 middle (3 and 6 %), 0.012 heavy "
+        "(9 and 19 %)",
+    )
+    dust_clouds: float = Field(
+        0.0,
+        ge=0.0,
+        le=20.0,
+        description="clouds of dust that wind and wheels raise near the vehicle, on streets and field, and that drift: "
+        "extinction of fresh dust, 1/m; 0.4 is light (1 to 2 % of the returns), 0.8 middle (about 6 %), 2 heavy (10 to 30 %; "
+        "some scans see little else)",
+    )
+    spray_per_m: float = Field(
+        0.0, ge=0.0, le=5.0, description="spray behind wheels on a wet road: extinction at 8 m/s, 1/m"
+    )
 
     beams: Literal[16, 32, 64] = Field(32, description="beams of the LiDAR")
     rate_hz: Literal[10, 20] = Field(10, description="sweeps per second, Hz")

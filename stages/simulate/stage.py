@@ -21,9 +21,9 @@ def simulate(settings: Settings) -> tuple[RawLog, TruthLog]:
     """Drive once; returns the log and, apart from it, the truth.
 
     RawLog: `sample_0.mcap` and `metadata.yaml`, a rosbag2 folder. TruthLog: `trajectory.parquet` (pose of the LiDAR at 100 Hz),
-    `points.parquet` (class and instance of every point, in the order of the messages), `fixes.parquet` (where the antenna
-    was at every fix, and which fixes lie) and `objects.parquet` (boxes of parked cars and houses). All are made in one
-    drive, when the log is written.
+    `points.parquet` (class, instance and material of every point, in the order of the messages), `fixes.parquet` (where the
+    antenna was at every fix, and which fixes lie), `objects.parquet` (boxes of parked cars and houses) and `tracks.parquet`
+    (boxes of what moves, scan by scan). All are made in one drive, when the log is written.
     """
     from scanloom.stages.simulate.drive import Drive
     from scanloom.stages.simulate.recording import LOG_FILE
@@ -36,6 +36,7 @@ def simulate(settings: Settings) -> tuple[RawLog, TruthLog]:
             "points.parquet": drive.write_points,
             "fixes.parquet": drive.write_fixes,
             "objects.parquet": drive.write_objects,
+            "tracks.parquet": drive.write_tracks,
         }
     )
     return log, truth

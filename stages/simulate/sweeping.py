@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,20 +11,17 @@ from numpy.typing import NDArray
 
 from scanloom.schemas.scans import PointClass
 from scanloom.stages.geometry.se3 import F8, inverse
+from scanloom.stages.simulate.grains import DUST_INSTANCE, Air, Grains
 from scanloom.stages.simulate.meshes import REFLECTIVITY, Material, Mesh
 from scanloom.stages.simulate.motion import Motion
-from scanloom.stages.simulate.rig import T_BASE, vehicle
+from scanloom.stages.simulate.rig import MIN_RANGE_M, T_BASE, WEAKEST, vehicle
 from scanloom.stages.simulate.settings import Settings
 from scanloom.stages.simulate.terrain import RASTER_M, SOUTH, WEST
 from scanloom.stages.simulate.town import Town
-from scanloom.stages.simulate.traffic import Actor, Puff, dust
+from scanloom.stages.simulate.traffic import Mover, Puff, dust
 
 BATCH_RAYS = 262_144
-MIN_RANGE_M = 0.4
 RESOLUTION_M = 0.002
-WEAKEST = 1.2e-5
-"""Received power, reflectivity over range squared, of which half the returns are lost."""
-DUST_INSTANCE = 60_000
 
 
 @dataclass(frozen=True)
@@ -41,24 +38,35 @@ class Sweep:
     """(n,) seconds after the start of the sweep."""
     kind: NDArray[np.uint8]
     instance: NDArray[np.uint16]
+    material: NDArray[np.uint8]
 
 
 @dataclass
 class _Echo:
-    """The nearest thing each ray meets: range m, cosine of incidence, material, class, instance."""
+    """The nearest thing each ray meets: range m, cosine of incidence, material, class, instance, and the strength of
+    what the air sent back (NaN where a surface did)."""
 
     range_m: NDArray[np.float32]
     cosine: NDArray[np.float32]
     material: NDArray[np.uint8]
     kind: NDArray[np.uint8]
     instance: NDArray[np.uint16]
+    airborne: NDArray[np.float32]
 
 
 class Lidar:
     """The sensor in its town."""
 
-    def __init__(self, settings: Settings, town: Town, motion: Motion, actors: list[Actor]) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        town: Town,
+        motion: Motion,
+        actors: Sequence[Mover],
+        weather: Sequence[Air] = (),
+    ) -> None:
         self._settings, self._town, self._motion, self._actors = settings, town, motion, actors
+        self._weather = weather
         mesh, self._kind, self._instance = town.triangles()
         self._material = mesh.material
         self._scene = scene_of(mesh)
@@ -111,6 +119,9 @@ class Lidar:
         self._add_actors(echo, times, origin, direction)
         for puff in dust(self._settings, self._town.path, self._actors, float(times[len(times) // 2])):
             _add_dust(echo, puff, origin, direction, rng)
+        for air in self._weather:
+            t = float(times[len(times) // 2])
+            _add_grains(echo, air.met(index, t, origin, direction, echo.range_m))
         return self._report(index, start_s, times, echo, rng)
 
     def _town_echo(self, hit: dict[str, Any], origin: F8, direction: F8) -> _Echo:
@@ -119,7 +130,10 @@ class Lidar:
         material = self._material[triangle]
         kind = np.where(found, self._kind[triangle], 0).astype(np.uint8)
         self._paint_ground(material, kind, origin, direction, hit["range"])
-        return _Echo(hit["range"].copy(), hit["cosine"], material, kind, self._instance[triangle].copy())
+        surface = np.full(len(kind), np.nan, np.float32)
+        return _Echo(
+            hit["range"].copy(), hit["cosine"], material, kind, self._instance[triangle].copy(), surface
+        )
 
     def _paint_ground(
         self,
@@ -159,7 +173,7 @@ class Lidar:
         centre_ray = origin[len(origin) // 2]
         for number, (actor, (scene, material)) in enumerate(zip(self._actors, self._bodies), start=1):
             to_actor = actor.poses(self._town.path, middle)[0, :3, 3] - centre_ray
-            reach = actor.radius_m + 2.5
+            reach = float(np.linalg.norm(actor.mesh.vertices, axis=1).max()) + 2.5
             if np.linalg.norm(to_actor) > self._settings.max_range_m + reach:
                 continue
             along = direction @ to_actor
@@ -181,7 +195,7 @@ class Lidar:
                 hit["range"][seen],
                 hit["cosine"][seen],
                 made_of,
-                PointClass.DYNAMIC,
+                actor.kind(float(middle[0])),
                 instance,
             )
 
@@ -194,8 +208,11 @@ class Lidar:
         stray = chance[0] < s.outliers
         measured[stray] = MIN_RANGE_M + (s.max_range_m - MIN_RANGE_M) * chance[1, stray]
         measured = np.round(measured / RESOLUTION_M) * RESOLUTION_M
-        strength = REFLECTIVITY[echo.material] * np.maximum(echo.cosine, 0.02)
-        power = strength / np.maximum(echo.range_m, 1.0) ** 2
+        surface = REFLECTIVITY[echo.material] * np.maximum(echo.cosine, 0.02)
+        in_air = ~np.isnan(echo.airborne)
+        strength = np.where(in_air, echo.airborne, surface)
+        # Of what is in the air only what is seen was met.
+        power = np.where(in_air, np.inf, strength / np.maximum(echo.range_m, 1.0) ** 2)
         lost = chance[2] < s.dropout + (1 - s.dropout) * WEAKEST / (WEAKEST + power)
         kept = np.isfinite(echo.range_m) & ~lost & (measured > MIN_RANGE_M) & (measured < s.max_range_m)
         rows = np.flatnonzero(kept)
@@ -211,6 +228,7 @@ class Lidar:
             time_s=time_s.astype(np.float32),
             kind=kind[rows],
             instance=echo.instance[rows],
+            material=echo.material[rows],
         )
 
 
@@ -253,6 +271,17 @@ def _replace(
     at = rows[nearer]
     echo.range_m[at], echo.cosine[at], echo.material[at] = range_m[nearer], cosine[nearer], material[nearer]
     echo.kind[at], echo.instance[at] = kind, instance
+
+
+def _add_grains(echo: _Echo, grains: Grains) -> None:
+    """Where a grain is nearer than what the ray met, it hides that; of two grains on one ray the nearer is seen."""
+    near_last = np.argsort(-grains.range_m, kind="stable")
+    rows, range_m = grains.rows[near_last], grains.range_m[near_last].astype(np.float32)
+    nearer = range_m < echo.range_m[rows]
+    at = rows[nearer]
+    echo.range_m[at], echo.airborne[at] = range_m[nearer], grains.strength[near_last][nearer]
+    echo.cosine[at], echo.material[at] = 1.0, grains.material
+    echo.kind[at], echo.instance[at] = PointClass.AIRBORNE, grains.instance
 
 
 def _add_dust(echo: _Echo, puff: Puff, origin: F8, direction: F8, rng: np.random.Generator) -> None:

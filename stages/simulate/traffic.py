@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
+from scanloom.schemas.scans import PointClass
 from scanloom.stages.geometry.se3 import F8, pose
 from scanloom.stages.simulate.meshes import Material, Mesh, car, cyclist, person, truck
 from scanloom.stages.simulate.motion import Motion
@@ -25,11 +27,34 @@ DUSTY_M = 45.0
 """From this far before the field the road is dry earth."""
 
 
+class Mover(Protocol):
+    """A moving object."""
+
+    @property
+    def name(self) -> str:
+        """Its own."""
+
+    @property
+    def what(self) -> str:
+        """`car`, `truck`, `bus`, `cyclist`, `person`, `dog` or `pram`."""
+
+    @property
+    def mesh(self) -> Mesh:
+        """Its shape, x forward, the origin on the ground."""
+
+    def poses(self, path: Path, t: F8) -> F8:
+        """T_world_mover (n, 4, 4) at times (n,) s."""
+
+    def kind(self, t: float) -> PointClass:
+        """What its points truly are at a time."""
+
+
 @dataclass(frozen=True)
 class Actor:
     """A moving object: its shape, and the arc length and offset to the left it has at a time."""
 
     name: str
+    what: str
     mesh: Mesh
     arc: Callable[[F8], F8]
     """Arc length (n,) m at times (n,) s."""
@@ -37,9 +62,8 @@ class Actor:
     backwards: bool = False
     """Drives against the direction of the path."""
 
-    @property
-    def radius_m(self) -> float:
-        return float(np.linalg.norm(self.mesh.vertices, axis=1).max())
+    def kind(self, t: float) -> PointClass:
+        return PointClass.DYNAMIC
 
     def poses(self, path: Path, t: F8) -> F8:
         """T_world_actor (n, 4, 4)."""
@@ -73,19 +97,27 @@ def build_traffic(settings: Settings, path: Path, motion: Motion) -> list[Actor]
         return lambda t: start_m + 12.5 * np.sin(speed / 12.5 * t + phase)
 
     actors = [
-        Actor("truck", truck(), follow(LEAD_S, 11.0), 0.0),
-        Actor("car behind", car(Material.PAINT_DARK), follow(-2.2, -6.0), 0.0),
+        Actor("truck", "truck", truck(), follow(LEAD_S, 11.0), 0.0),
+        Actor("car behind", "car", car(Material.PAINT_DARK), follow(-2.2, -6.0), 0.0),
     ]
     for k in range(9):
         start = path.length_m * (k + rng.uniform(0.1, 0.9)) / 9
         paint = Material.PAINT_LIGHT if k % 2 else Material.PAINT_DARK
-        actors.append(Actor(f"oncoming {k}", car(paint), cruise(start, -rng.uniform(5, 8)), ONCOMING_M, True))
-    actors.append(Actor("cyclist", cyclist(), cruise(35.0, 4.2), -2.2))
+        actors.append(
+            Actor(f"oncoming {k}", "car", car(paint), cruise(start, -rng.uniform(5, 8)), ONCOMING_M, True)
+        )
+    actors.append(Actor("cyclist", "cyclist", cyclist(), cruise(35.0, 4.2), -2.2))
     for k in range(8):
         start = rng.uniform(0.0, 420.0)
         walk = stroll(start, rng.uniform(0.9, 1.5), rng.uniform(0, 6.28))
         actors.append(
-            Actor(f"person {k}", person(rng.uniform(0.15, 0.3)), walk, PAVEMENT_M - rng.uniform(0, 1.5))
+            Actor(
+                f"person {k}",
+                "person",
+                person(rng.uniform(0.15, 0.3)),
+                walk,
+                PAVEMENT_M - rng.uniform(0, 1.5),
+            )
         )
     return [actor for actor in actors if _keeps_clear(actor, settings, path, motion)]
 
@@ -107,7 +139,7 @@ class Puff:
     extinction: float
 
 
-def dust(settings: Settings, path: Path, actors: list[Actor], t: float) -> list[Puff]:
+def dust(settings: Settings, path: Path, actors: Sequence[Mover], t: float) -> list[Puff]:
     """What the truck's wheels raised on the field within the last seconds: it spreads and thins out."""
     if not actors or settings.dust_per_m == 0:
         return []
