@@ -107,7 +107,7 @@ def _follow(lowest: F8, highest: F8, plane: F8) -> F8:
                 continue
             step = center(b) - r
             rise = lowest[s, b] - (z + k * step)
-            reach = min(step, 4.0)
+            reach = min(step, 4.0 if r > 0.0 else 2.0)  # near the sensor the plane tells more
             flat = highest[s, b] - lowest[s, b] < FLAT_M
             above = 0.12 + 0.1 * reach if flat else 0.1 + 0.03 * reach
             if rise < -0.25 - 0.1 * reach:
