@@ -1,0 +1,105 @@
+"""How far along each ray space is certainly free: the return's range, less what the surface it met may hide.
+
+A ray that grazes a surface runs close above it for long before it meets it: with a clearance c and an angle a between ray
+and surface, the last c / sin(a). The angle comes from the neighbouring returns in an image of directions.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.stages.geometry.kernels import kernel
+
+F4 = NDArray[np.float32]
+I4 = NDArray[np.int32]
+
+ROWS, COLUMNS = 256, 1024
+LOWEST_RAD, HIGHEST_RAD = np.radians(-56.0), np.radians(56.0)
+ROW_RAD = (HIGHEST_RAD - LOWEST_RAD) / ROWS
+BESIDE, ABOVE = 2, 5
+"""Cells to each side, and upwards and downwards, in which the next return is looked for."""
+LEAST_SINE = 0.02
+
+
+def new_image() -> I4:
+    """An image of directions to be filled with numbers of returns."""
+    return np.empty((ROWS, COLUMNS), np.int32)
+
+
+@kernel
+def fill(x: F4, y: F4, z: F4, image: I4) -> I4:
+    """Put the nearest return of every direction into the image; returns the cell (n,) of each, -1 outside."""
+    image[:] = -1
+    cell = np.full(len(x), -1, np.int32)
+    nearest = np.full(ROWS * COLUMNS, np.inf, np.float32)
+    flat = image.reshape(-1)
+    for n in range(len(x)):
+        px, py, pz = float(x[n]), float(y[n]), float(z[n])
+        r = np.sqrt(px * px + py * py + pz * pz)
+        if not r > 0.0:
+            continue
+        row = int(np.floor((np.arcsin(pz / r) - LOWEST_RAD) / ROW_RAD))
+        if not 0 <= row < ROWS:
+            continue
+        column = int((np.arctan2(py, px) + np.pi) * (COLUMNS / (2.0 * np.pi))) % COLUMNS
+        cell[n] = row * COLUMNS + column
+        if r < nearest[cell[n]]:
+            nearest[cell[n]] = r
+            flat[cell[n]] = n
+    return cell
+
+
+@kernel
+def clear_ranges(x: F4, y: F4, z: F4, cell: I4, image: I4, clearance_m: float) -> F4:
+    """Range (n,), m, up to which each ray passes freely; 0 for returns outside the image."""
+    out = np.zeros(len(x), np.float32)
+    for n in range(len(x)):
+        if cell[n] < 0:
+            continue
+        row, column = cell[n] // COLUMNS, cell[n] % COLUMNS
+        sine = min(_beside(x, y, z, n, row, column, image), _above(x, y, z, n, row, column, image))
+        px, py, pz = float(x[n]), float(y[n]), float(z[n])
+        r = np.sqrt(px * px + py * py + pz * pz)
+        out[n] = r - clearance_m / max(sine, LEAST_SINE)
+    return out
+
+
+@kernel
+def _beside(x: F4, y: F4, z: F4, n: int, row: int, column: int, image: I4) -> float:
+    """Sine of the angle between ray and surface, by the returns left and right; of the steeper side at an edge."""
+    best = -1.0
+    for side in (-1, 1):
+        for step in range(1, BESIDE + 1):
+            other = image[row, (column + side * step) % COLUMNS]
+            if other >= 0:
+                best = max(best, _sine(x, y, z, n, other))
+                break
+    return best if best >= 0.0 else 1.0
+
+
+@kernel
+def _above(x: F4, y: F4, z: F4, n: int, row: int, column: int, image: I4) -> float:
+    """The same by the returns above and below."""
+    best = -1.0
+    for side in (-1, 1):
+        for step in range(1, ABOVE + 1):
+            if not 0 <= row + side * step < ROWS:
+                break
+            other = image[row + side * step, column]
+            if other >= 0:
+                best = max(best, _sine(x, y, z, n, other))
+                break
+    return best if best >= 0.0 else 1.0
+
+
+@kernel
+def _sine(x: F4, y: F4, z: F4, n: int, other: int) -> float:
+    """Sine of the angle between the ray to a return and the line from it to another return."""
+    px, py, pz = float(x[n]), float(y[n]), float(z[n])
+    dx, dy, dz = float(x[other]) - px, float(y[other]) - py, float(z[other]) - pz
+    square = (dx * dx + dy * dy + dz * dz) * (px * px + py * py + pz * pz)
+    if not square > 0.0:
+        return 1.0
+    along = dx * px + dy * py + dz * pz
+    return np.sqrt(max(1.0 - along * along / square, 0.0))

@@ -1,0 +1,83 @@
+"""Verdicts by place: those of the tiles that a chunk's points lie in, tile by tile from their files."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.schemas.clean import BRICK_VOXELS, Cleared
+from scanloom.schemas.product import Parts
+from scanloom.schemas.scans import DeskewedScan
+from scanloom.stages.clean.field import I4, I8, brick_key, inner, insert_all, row_of
+from scanloom.stages.geometry.kernels import kernel
+from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.voxels import EMPTY, table_length
+
+B1 = NDArray[np.bool_]
+F4 = NDArray[np.float32]
+U1 = NDArray[np.uint8]
+
+AHEAD_M = 150.0
+"""Tiles within this distance of a scan are opened; farther ones are let go."""
+
+
+class Verdicts:
+    """Looks verdicts up; holds only the tiles around the last scan."""
+
+    def __init__(self, cleared: Parts[Cleared]) -> None:
+        self._cleared = cleared
+        where = [c["tile"].split("_") for c in cleared.coordinates()]
+        self._tiles = np.array([[int(a), int(b)] for a, b in where], np.int64).reshape(-1, 2)
+        self._held: frozenset[int] = frozenset()
+        self._size_m = cleared[0].tile_size_m if len(cleared) else 0.0
+        self._voxel_m = cleared[0].voxel_size_m if len(cleared) else 1.0
+        self._index([])
+
+    def of(self, scan: DeskewedScan, asked: B1, T_world_lidar: F8) -> U1:
+        """Standing (n,) of the points of a scan that are asked, UNKNOWN of the others."""
+        self._move_to(T_world_lidar[:2, 3])
+        said: U1 = standing(
+            scan.x_m, scan.y_m, scan.z_m, asked, np.ascontiguousarray(T_world_lidar), 1.0 / self._voxel_m,
+            self._keys, self._rows, self._verdict,
+        )  # fmt: skip
+        return said
+
+    def _move_to(self, place: F8) -> None:
+        low = self._tiles * self._size_m
+        off = np.maximum(np.maximum(low - place, place - low - self._size_m), 0.0)
+        distance = np.hypot(off[:, 0], off[:, 1])
+        if all(n in self._held for n in np.flatnonzero(distance < 0.7 * AHEAD_M)):
+            return
+        wanted = np.flatnonzero(distance < AHEAD_M)
+        self._held = frozenset(wanted.tolist())
+        self._index([self._cleared[int(n)] for n in wanted])
+
+    def _index(self, tables: list[Cleared]) -> None:
+        """One table of all; a brick at a border is in two tiles, each with verdicts on its own voxels only."""
+        brick = np.concatenate([np.empty(0, np.int64), *(t.brick for t in tables)])
+        said = np.concatenate([np.empty((0, BRICK_VOXELS), np.uint8), *(t.verdict for t in tables)])
+        bricks, row = np.unique(brick, return_inverse=True)
+        self._verdict = np.zeros((len(bricks), BRICK_VOXELS), np.uint8)
+        np.maximum.at(self._verdict, row, said)
+        self._keys = np.full(table_length(max(len(bricks), 1)), EMPTY, np.int64)
+        self._rows = np.zeros(len(self._keys), np.int32)
+        insert_all(self._keys, self._rows, bricks)
+
+
+@kernel
+def standing(
+    x: F4, y: F4, z: F4, asked: B1, T: F8, per_m: float, keys: I8, rows: I4, verdict: U1
+) -> U1:  # fmt: skip
+    """Verdict (n,) on the voxel of each asked point."""
+    out = np.zeros(len(x), np.uint8)
+    for n in range(len(x)):
+        if not asked[n]:
+            continue
+        px, py, pz = float(x[n]), float(y[n]), float(z[n])
+        i = np.int64(np.floor((T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]) * per_m))
+        j = np.int64(np.floor((T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]) * per_m))
+        k = np.int64(np.floor((T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]) * per_m))
+        row = row_of(keys, rows, brick_key(i, j, k))
+        if row >= 0:
+            out[n] = verdict[row, inner(i, j, k)]
+    return out

@@ -1,0 +1,121 @@
+"""Rays: what the scans of one chunk say of the free space around them, voxel by voxel and tile by tile.
+
+Scans are taken together in bins of a fraction of a second. Each return marks its voxel and blocks those around it for its
+bin; then every ray is walked from the sensor to well before its return, and what it passes unblocked was free in this bin.
+Poses are those of the finished map. Source: methods 1.5.1 and 1.5.2 (occupancy by rays), with two differences: bins instead
+of log-odds, so that what stood for long and then left is told from what is half transparent; and the blocked neighbourhood,
+which takes up errors of poses and ranges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from scanloom.schemas.clean import BRICK_SIDE, Rays
+from scanloom.schemas.product import Part
+from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
+from scanloom.schemas.trajectory import Poses
+from scanloom.stages.clean import incidence
+from scanloom.stages.clean.field import AFTER, BEFORE, BETWEEN, HITS
+from scanloom.stages.clean.field import Field as VoxelField
+from scanloom.stages.clean.tiles import bricks_by_tile
+from scanloom.stages.clean.walking import mark_hits, walk
+
+VERSION = 1
+
+SEEN = (PointClass.UNLABELLED, PointClass.GROUND, PointClass.STATIC, PointClass.DYNAMIC)
+"""Classes whose returns end a ray; those of dust, strays and the own vehicle say nothing."""
+
+
+class Settings(BaseModel):
+    """How finely free space is resolved, and how close to a return a ray counts."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    voxel_size_m: float = Field(0.2, ge=0.05, le=1.0, description="edge of a voxel, m")
+    tile_size_m: float = Field(
+        50.0, ge=8.0, le=1000.0, description="edge of a tile that is decided as one, m"
+    )
+    bin_s: float = Field(0.3, ge=0.0, le=10.0, description="scans within this time speak as one, s")
+    reach_m: float = Field(60.0, ge=5.0, le=300.0, description="rays say nothing beyond this range, m")
+    clearance_m: float = Field(
+        0.3, ge=0.0, le=5.0, description="a ray counts until it comes this close to the surface it meets, m"
+    )
+
+
+Pair = tuple[DeskewedScan, ScanLabels]
+
+
+def rays(settings: Settings, deskewed: Deskewed, labels: Labels, poses: Poses) -> Iterator[Part[Rays]]:
+    """Bins that hit and that saw through each voxel, for every tile that the chunk's rays cross.
+
+    Memory is bounded by the space that the chunk sees.
+    """
+    T_of = {int(i): T for i, T in zip(poses.scan_index, poses.T_world_lidar) if np.isfinite(T).all()}
+    field, image = VoxelField(), incidence.new_image()
+    for number, pairs in enumerate(_bins(deskewed, labels, settings.bin_s), start=1):
+        placed = [
+            (*_seen(scan, label), T_of[scan.scan_index]) for scan, label in pairs if scan.scan_index in T_of
+        ]
+        _mark(settings, field, image, field.stamp(number), placed)
+    yield from _parts(settings, field, poses.frame)
+
+
+def _bins(deskewed: Deskewed, labels: Labels, bin_s: float) -> Iterator[list[Pair]]:
+    """Scans with their labels, those of a bin together."""
+    waiting: list[Pair] = []
+    for pair in zip(deskewed, labels, strict=True):
+        if waiting and pair[0].reference_ns - waiting[0][0].reference_ns > 1e9 * bin_s:
+            yield waiting
+            waiting = []
+        waiting.append(pair)
+    if waiting:
+        yield waiting
+
+
+def _seen(scan: DeskewedScan, label: ScanLabels) -> tuple[np.ndarray, ...]:
+    rows = np.flatnonzero(np.isin(label.class_, SEEN))
+    return tuple(np.ascontiguousarray(c[rows]) for c in (scan.x_m, scan.y_m, scan.z_m, label.class_))
+
+
+def _mark(settings: Settings, field: VoxelField, image: np.ndarray, bin_: int, placed: list[tuple]) -> None:
+    """All returns of a bin before its rays: a return of one scan blocks the rays of the others."""
+    for x, y, z, classes, T in placed:
+        _until_done(
+            field, mark_hits, (x, y, z, classes, T, bin_, settings.reach_m, settings.voxel_size_m), len(x)
+        )
+    for x, y, z, _, T in placed:
+        clear = incidence.clear_ranges(x, y, z, incidence.fill(x, y, z, image), image, settings.clearance_m)
+        _until_done(field, walk, (x, y, z, clear, T, bin_, settings.reach_m, settings.voxel_size_m), len(x))
+
+
+def _until_done(field: VoxelField, kernel: object, arguments: tuple, count: int) -> None:
+    """Go on where the field was full, with more room."""
+    done = 0
+    while True:
+        done = kernel(*arguments, done, field.keys, field.rows, field.order, field.count, field.voxels)  # type: ignore[operator]
+        if done == count:
+            return
+        field.grow()
+
+
+def _parts(settings: Settings, field: VoxelField, frame: str) -> Iterator[Part[Rays]]:
+    brick_m = BRICK_SIDE * settings.voxel_size_m
+    for name, rows in bricks_by_tile(field.bricks, brick_m, settings.tile_size_m, settings.voxel_size_m):
+        layers = field.voxels[rows]
+        yield Part(
+            Rays(
+                brick=field.bricks[rows],
+                hits=np.ascontiguousarray(layers[:, HITS]),
+                before=np.ascontiguousarray(layers[:, BEFORE]),
+                between=np.ascontiguousarray(layers[:, BETWEEN]),
+                after=np.ascontiguousarray(layers[:, AFTER]),
+                voxel_size_m=settings.voxel_size_m,
+                tile_size_m=settings.tile_size_m,
+                frame=frame,
+            ),
+            name,
+        )

@@ -1,0 +1,104 @@
+"""Relabel: the final class of every point of a chunk, from what the whole map says of its place.
+
+A point's voxel says whether what the session met there moved or has changed. Of a thing that hangs together in a scan, most
+of which moved, all moved: its wheels, which rays to the ground hardly pass, and its roof before the sky, which none passes.
+Classes that denoise gave for reasons of its own (ground, own vehicle, dust, strays) stay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from scanloom.schemas.clean import Cleared, FinalLabels, Standing
+from scanloom.schemas.product import Parts
+from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
+from scanloom.schemas.trajectory import Poses
+from scanloom.stages.clean import incidence
+from scanloom.stages.clean.clusters import clusters
+from scanloom.stages.clean.lookup import Verdicts
+from scanloom.stages.geometry.se3 import F8
+
+VERSION = 1
+
+U1 = NDArray[np.uint8]
+B1 = NDArray[np.bool_]
+JUDGED = (PointClass.UNLABELLED, PointClass.STATIC)
+
+
+class Settings(BaseModel):
+    """How the points of a scan are decided together."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    apart_m: float = Field(
+        0.4,
+        ge=0.05,
+        le=5.0,
+        description="neighbours in a scan whose ranges differ by less belong together, m",
+    )
+    moved_share: float = Field(
+        0.4, ge=0.05, le=1.0, description="a thing moved as a whole when this share of its points did"
+    )
+    least_points: int = Field(
+        5, ge=1, le=1000, description="points that hang together are a thing from this number on"
+    )
+
+
+def relabel(
+    settings: Settings, deskewed: Deskewed, labels: Labels, cleared: Parts[Cleared], poses: Poses
+) -> FinalLabels:
+    """A class for every point of every scan of a chunk, scan by scan, in the order of the points.
+
+    Scans without a pose keep the classes they have.
+    """
+    return FinalLabels(_relabelled(settings, deskewed, labels, cleared, poses))
+
+
+def _relabelled(
+    settings: Settings, deskewed: Deskewed, labels: Labels, cleared: Parts[Cleared], poses: Poses
+) -> Iterator[ScanLabels]:
+    T_of = {int(i): T for i, T in zip(poses.scan_index, poses.T_world_lidar) if np.isfinite(T).all()}
+    verdicts, image = Verdicts(cleared), incidence.new_image()
+    for scan, label in zip(deskewed, labels, strict=True):
+        T = T_of.get(scan.scan_index)
+        classes = label.class_ if T is None else final(settings, scan, label.class_, verdicts, T, image)
+        yield ScanLabels(class_=classes, reference_ns=label.reference_ns, scan_index=label.scan_index)
+
+
+def final(
+    settings: Settings,
+    scan: DeskewedScan,
+    classes: U1,
+    verdicts: Verdicts,
+    T_world_lidar: F8,
+    image: NDArray[np.int32],
+) -> U1:
+    """Final classes (n,) of the points of one scan."""
+    judged = np.isin(classes, JUDGED)
+    said = verdicts.of(scan, judged, T_world_lidar)
+    thing = _things(settings, scan, judged & (said != Standing.STANDS), image)
+    out = classes.copy()
+    for standing_, class_ in ((Standing.CHANGED, PointClass.CHANGED), (Standing.MOVED, PointClass.DYNAMIC)):
+        told = said == standing_
+        out[told | (judged & _with_the_rest(settings, thing, told))] = class_
+    return out
+
+
+def _things(
+    settings: Settings, scan: DeskewedScan, usable: B1, image: NDArray[np.int32]
+) -> NDArray[np.int32]:
+    x, y, z = scan.x_m, scan.y_m, scan.z_m
+    found: NDArray[np.int32] = clusters(x, y, z, usable, incidence.fill(x, y, z, image), settings.apart_m)
+    return found
+
+
+def _with_the_rest(settings: Settings, thing: NDArray[np.int32], told: B1) -> B1:
+    """Points (n,) of things of which enough points are told."""
+    points = np.bincount(thing, minlength=len(thing))
+    share = np.bincount(thing, weights=told, minlength=len(thing)) / np.maximum(points, 1)
+    moved = (points >= settings.least_points) & (share >= settings.moved_share)
+    return moved[thing]

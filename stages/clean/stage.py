@@ -1,0 +1,129 @@
+"""Clean: which voxels of a tile held something that passed, left, or changed between sessions.
+
+All that the rays of all chunks and sessions say of a tile is added up in the order of time. What a session met in a voxel
+moved if its own rays saw through the voxel at other times; it has changed if those of other sessions did. Labels only: what is
+to become of such points is decided in tiling. One tile needs no other; memory is bounded by the tile and its sessions are
+gone through one by one. Source: methods 1.5.1 (free-space conflict).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from scanloom.schemas.clean import BRICK_SIDE, Cleared, Rays, Standing
+from scanloom.schemas.product import Part, Parts
+from scanloom.stages.clean.evidence import MOST, U2, Evidence, all_bricks
+from scanloom.stages.clean.tiles import brick_indices
+from scanloom.stages.clean.verdicts import U1, judge_others, judge_own
+
+VERSION = 1
+
+
+class Settings(BaseModel):
+    """When what was met in a voxel counts as gone."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    seen_through: float = Field(
+        1.0, ge=0.0, le=100.0, description="moved: seen through this many times as often as met, ratio"
+    )
+    left_bins: int = Field(
+        5,
+        ge=1,
+        le=1000,
+        description="stood and left: seen through in so many bins before or after it was met",
+    )
+    flicker: float = Field(
+        0.1, ge=0.0, le=1.0, description="stood and left: free bins between hits over those outside, at most"
+    )
+    stands_share: float = Field(
+        0.3, ge=0.0, le=1.0, description="stands: seen through at most this many times as often as met, ratio"
+    )
+    changed_bins: int = Field(
+        5, ge=1, le=1000, description="changed: other sessions saw through it in so many bins"
+    )
+    changed_hits: float = Field(
+        0.05,
+        ge=0.0,
+        le=1.0,
+        description="changed: bins of other sessions that met something over free ones, at most",
+    )
+
+
+def clean(settings: Settings, rays: Parts[Rays]) -> Iterator[Part[Cleared]]:
+    """Verdicts on the voxels of one tile for each session that passed it."""
+    order, where = _by_session(rays), rays.coordinates()[0]["tile"]
+    bricks = all_bricks(rays[n] for numbers in order.values() for n in numbers)
+    several = len(order) > 1
+    total = np.zeros((2, *Evidence.of(bricks).hits.shape), np.uint32) if several else None
+    if total is not None:
+        for numbers in order.values():
+            evidence = _evidence(bricks, rays, numbers)
+            total[0] += evidence.hits
+            total[1] += evidence.through
+    for session, numbers in order.items():
+        evidence = _evidence(bricks, rays, numbers)
+        verdict = _own(settings, evidence)
+        if total is not None:
+            _changed(settings, evidence, verdict, total)
+        _only_own(evidence.bricks, verdict, where, rays[0])
+        yield Part(_cleared(evidence, verdict, rays[0]), session)
+
+
+def _by_session(rays: Parts[Rays]) -> dict[str, list[int]]:
+    """Numbers of the parts of each session; chunks are numbered in the order of time."""
+    numbers: dict[str, list[int]] = {}
+    for n, where in enumerate(rays.coordinates()):
+        numbers.setdefault(where["session"], []).append(n)
+    return numbers
+
+
+def _evidence(bricks: np.ndarray, rays: Parts[Rays], numbers: list[int]) -> Evidence:
+    evidence = Evidence.of(bricks)
+    for n in numbers:
+        evidence.add(rays[n])
+    return evidence
+
+
+def _own(settings: Settings, evidence: Evidence) -> U1:
+    verdict: U1 = judge_own(
+        evidence.bricks, evidence.keys, evidence.rows, evidence.hits, evidence.through, evidence.between,
+        settings.seen_through, settings.left_bins, settings.flicker, settings.stands_share,
+    )  # fmt: skip
+    return verdict
+
+
+def _changed(settings: Settings, evidence: Evidence, verdict: U1, total: np.ndarray) -> None:
+    other_hits = _capped(total[0] - evidence.hits)
+    other_through = _capped(total[1] - evidence.through)
+    judge_others(
+        evidence.bricks, evidence.keys, evidence.rows, verdict, evidence.hits, other_hits, other_through,
+        settings.changed_bins, settings.changed_hits,
+    )  # fmt: skip
+
+
+def _capped(counts: np.ndarray) -> U2:
+    return np.minimum(counts, MOST).astype(np.uint16)
+
+
+def _only_own(bricks: np.ndarray, verdict: U1, tile: str, rays: Rays) -> None:
+    """Leave what lies in the bricks but not in the tile to its neighbours."""
+    corner = np.array([int(n) for n in tile.split("_")]) * rays.tile_size_m
+    first = brick_indices(bricks)[:, :2] * BRICK_SIDE
+    for axis in range(2):
+        middle_m = (first[:, axis, None] + np.arange(BRICK_SIDE) + 0.5) * rays.voxel_size_m
+        beyond = (middle_m < corner[axis]) | (middle_m >= corner[axis] + rays.tile_size_m)
+        cube = verdict.reshape(-1, BRICK_SIDE, BRICK_SIDE, BRICK_SIDE)
+        shape = (-1, BRICK_SIDE, 1, 1) if axis == 0 else (-1, 1, BRICK_SIDE, 1)
+        cube[np.broadcast_to(beyond.reshape(shape), cube.shape)] = Standing.UNKNOWN
+
+
+def _cleared(evidence: Evidence, verdict: U1, rays: Rays) -> Cleared:
+    told = np.flatnonzero((verdict != Standing.UNKNOWN).any(axis=1))
+    return Cleared(
+        brick=evidence.bricks[told], verdict=verdict[told],
+        voxel_size_m=rays.voxel_size_m, tile_size_m=rays.tile_size_m,
+    )  # fmt: skip
