@@ -16,7 +16,8 @@ from typing import Any, TypeVar
 from scanloom.pipeline.request import Request, SessionInput
 from scanloom.pipeline.run import Result, run
 from scanloom.pipeline.store import Store
-from scanloom.schemas.product import Parts, Product
+from scanloom.schemas.base import BaseLog
+from scanloom.schemas.product import Files, Parts, Product
 from scanloom.schemas.scans import Deskewed, Scans
 from scanloom.schemas.session import RawLog, TruthLog
 from scanloom.schemas.trajectory import Truth
@@ -43,8 +44,8 @@ def _makers(wanted: Sequence[type[Product]]) -> set[str]:
     found: set[str] = set()
     waiting = [*wanted]
     while waiting:
-        node = WRITER_OF[waiting.pop()]
-        if node.name not in found:
+        node = WRITER_OF.get(waiting.pop())
+        if node is not None and node.name not in found:
             found.add(node.name)
             waiting += node.reads
     return found
@@ -160,9 +161,12 @@ def produced(drive: Drive, wanted: Sequence[type[Product]], store: Path) -> Resu
 
 def _session(drive: Drive) -> SessionInput:
     if drive.folder is None:
-        return SessionInput(drive.name, {}, {"simulate": dict(drive.simulate or {})}, frozenset({SIMULATED}))
+        return SessionInput(
+            drive.name, {BaseLog: BaseLog()}, {"simulate": dict(drive.simulate or {})}, frozenset({SIMULATED})
+        )
     log = locate(drive.folder)
-    return SessionInput(drive.name, {RawLog: log.raw_log, TruthLog: log.truth_log}, log.settings)
+    sources: dict[type[Product], Files] = {RawLog: log.raw_log, TruthLog: log.truth_log, BaseLog: BaseLog()}
+    return SessionInput(drive.name, sources, log.settings)
 
 
 def _sequence(drive: Drive, result: Result) -> Recording:

@@ -1,0 +1,154 @@
+"""Cleaning against DUFOMap: what stands stays, what passed goes; crispness, localisation and time. `make bench BENCH=clean`.
+
+    python -m benchmarks.clean                                    every scene
+    python -m benchmarks.clean --only town_32 --systems dufomap   one scene, one system
+    python -m benchmarks.clean --fresh --json -                   times of one run, figures as JSON
+
+Scenes are simulated, or real where `../shared/data` is there. What a system keeps of a scene is remembered until its version
+(of ours: the code of the stages) or the scene changes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from benchmarks.clean_nearness import F4, Mask
+from benchmarks.clean_scenes import ESTIMATED, PLACES, Scene, scene
+from benchmarks.clean_scores import (
+    Accuracy,
+    accuracy,
+    by_range,
+    is_dynamic,
+    is_static,
+    kept_in_map,
+    may_stand,
+)
+from benchmarks.clean_systems import SYSTEMS, Outcome, System, classify
+from benchmarks.clean_utility import entropy_scores, localisation, localisation_scores
+from benchmarks.scores import Figure, Score
+
+WORK = Path("build/bench")
+PREFIX = "bench.clean"
+KEPT_BY = "a point counts as kept with a kept point within 0.05 m"
+
+console = Console(stderr=True, width=200)
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Everything the command line asks for."""
+    options = _options(words)
+    systems = [SYSTEMS[name] for name in options.systems if _there(SYSTEMS[name])]
+    figures: list[Figure] = []
+    for name in options.only or PLACES:
+        place = PLACES[name]
+        if place.drive.folder is not None and not place.drive.folder.exists():
+            console.print(f"{name} is left out: there are no scans at {place.drive.folder}")
+            continue
+        found = scene(place, options.store, WORK / "clean")
+        for poses in place.poses:
+            figures += _shown(_of_scene(found, poses, systems, options))
+    _write(figures, options.json)
+
+
+def _options(words: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", nargs="+", choices=tuple(PLACES), default=[], help="only these scenes")
+    parser.add_argument("--systems", nargs="+", choices=tuple(SYSTEMS), default=tuple(SYSTEMS))
+    parser.add_argument("--store", type=Path, default=WORK / "store", help="store of the scenes' products")
+    parser.add_argument("--fresh", action="store_true", help="run every system again, for times of one run")
+    parser.add_argument("--quick", action="store_true", help="accuracy and time alone")
+    parser.add_argument("--json", default="", help="file for the figures, or - for standard output")
+    return parser.parse_args(words)
+
+
+def _there(system: System) -> bool:
+    if not system.version():
+        console.print(f"{system.name} is left out: it is not installed (make bench-setup)")
+    return bool(system.version())
+
+
+def _shown(figures: Iterator[Figure]) -> Iterator[Figure]:
+    """The figures, each said on the screen as soon as it is there; how they are made is in the JSON."""
+    for figure in figures:
+        console.print(f"{figure.name:72} {figure.value:12.5g} {figure.unit}", highlight=False)
+        yield figure
+
+
+def _of_scene(
+    found: Scene, poses: str, systems: Sequence[System], options: argparse.Namespace
+) -> Iterator[Figure]:
+    placed = found.placed(poses)
+    everything = np.ones(len(placed), np.bool_)
+    before = None if options.quick else localisation(found, poses, everything)
+    for system in systems:
+        outcome, held = _best(system, found, poses, placed, options.fresh)
+        scores = [*_accuracy_scores(found, held), *_time(outcome)]
+        if before is not None and system.name != "none":
+            scores += entropy_scores(placed, outcome.kept, may_stand(found.true_class))
+            scores += localisation_scores(before, localisation(found, poses, outcome.kept))
+        scope = found.name if poses == ESTIMATED else f"{found.name}_{poses}"
+        for score in scores:
+            name = f"{PREFIX}.{scope}.{system.name}.{score.name}"
+            yield Figure(
+                name, score.value, score.unit, scope, f"{score.method}; {outcome.how}; {poses} poses"
+            )
+
+
+def _best(system: System, found: Scene, poses: str, placed: F4, fresh: bool) -> tuple[Outcome, Mask]:
+    """The variant with the highest associated accuracy, and which points of the ground truth its output holds."""
+    static, dynamic = is_static(found.true_class), is_dynamic(found.true_class)
+    tried = []
+    for variant in system.variants:
+        outcome = classify(system, variant, found, poses, fresh)
+        held = kept_in_map(placed, outcome.kept, static | dynamic)
+        tried.append((accuracy(static, dynamic, held).merit, outcome, held))
+    _, outcome, held = max(tried, key=lambda each: each[0])
+    return outcome, held
+
+
+def _accuracy_scores(found: Scene, held: Mask) -> Iterator[Score]:
+    static, dynamic = is_static(found.true_class), is_dynamic(found.true_class)
+    yield from _four("", accuracy(static, dynamic, held))
+    for ring, part in by_range(found.points, static, dynamic, held):
+        yield from _four(f"range_{ring}.", part)
+    for kind in sorted(set(found.kinds.values())):
+        numbers = [number for number, what in found.kinds.items() if what == kind]
+        own = np.isin(found.instance, numbers)
+        yield from _four(f"kind_{kind.replace(' ', '_')}.", accuracy(static & own, dynamic & own, held))
+
+
+def _four(where: str, found: Accuracy) -> Iterator[Score]:
+    """The figures that there are points for."""
+    n = f"{found.static} static, {found.dynamic} dynamic points; {KEPT_BY}"
+    if found.static:
+        yield Score(f"{where}sa_percent", found.sa, "%", f"static accuracy, {n}")
+    if found.dynamic:
+        yield Score(f"{where}da_percent", found.da, "%", f"dynamic accuracy, {n}")
+    if found.static and found.dynamic:
+        yield Score(f"{where}aa_percent", found.aa, "%", f"associated accuracy, {n}")
+        yield Score(f"{where}ha_percent", found.ha, "%", f"harmonic accuracy, {n}")
+
+
+def _time(outcome: Outcome) -> Iterator[Score]:
+    if np.isfinite(outcome.ms_per_scan):
+        yield Score("ms_per_scan", outcome.ms_per_scan, "ms", "mean wall time, without reading")
+
+
+def _write(figures: Sequence[Figure], where: str) -> None:
+    text = json.dumps([figure.row() for figure in figures if np.isfinite(figure.value)], indent=1)
+    if where == "-":
+        print(text)
+    elif where:
+        Path(where).write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()

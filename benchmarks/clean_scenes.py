@@ -1,0 +1,237 @@
+"""The scenes that maps are cleaned on: made through the workflow, gathered into flat arrays, kept on disk.
+
+A scene holds every point that counts: those that denoise calls own vehicle or out of range are left out, the same for all
+systems. Where there is truth of poses there are two sets of them: true ones, and those of fusion.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.clean_boxes import LABELS, BoxTrack, boxed, read_boxes
+from benchmarks.clean_scores import UNJUDGED
+from benchmarks.sequences import Drive, produced
+from scanloom.pipeline.run import Result
+from scanloom.schemas.scans import (
+    Deskewed,
+    DeskewedScan,
+    Labels,
+    PointClass,
+    ScanLabels,
+    TrueLabels,
+    TruePoints,
+)
+from scanloom.schemas.session import Session, TruthLog
+from scanloom.schemas.simulated import TrueObjects
+from scanloom.schemas.tracks import Imu, Wheel
+from scanloom.schemas.trajectory import Odometry, Poses, Truth
+from scanloom.stages.geometry.interpolation import interpolate_poses
+from scanloom.stages.geometry.se3 import F8
+
+MADE = (Truth, Deskewed, Labels, Session, Imu, Wheel, Odometry, Poses)
+LEFT_OUT = (PointClass.EGO, PointClass.OUT_OF_RANGE)
+REAL = Path("../shared/data/kitti_raw_0005")
+TRUE, ESTIMATED = "truth", "estimated"
+
+_TOWN: dict[str, Any] = {"start_m": 0.0, "duration_s": 60.0}
+
+
+@dataclass(frozen=True)
+class Place:
+    """What a scene is made of."""
+
+    drive: Drive
+    poses: tuple[str, ...] = (TRUE, ESTIMATED)
+    objects: bool = True
+    """Something moves in it."""
+
+
+PLACES: Mapping[str, Place] = {
+    "town_32": Place(Drive("town_32", "town, 32 beams", {**_TOWN, "beams": 32})),
+    "town_64": Place(Drive("town_64", "town, 64 beams", {**_TOWN, "duration_s": 40.0, "beams": 64})),
+    "quiet": Place(
+        Drive("quiet", "town without traffic", {**_TOWN, "duration_s": 40.0, "traffic": False}), objects=False
+    ),
+    "kitti_0005": Place(Drive("kitti_0005", "KITTI 0005", folder=REAL), (ESTIMATED,)),
+}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Points of all scans one after the other, and what they are; arrays are read from disk as needed."""
+
+    name: str
+    title: str
+    folder: Path
+    points: NDArray[np.float32]
+    """(n, 3) m, in the LiDAR's frame of the point's scan."""
+    labels: NDArray[np.uint8]
+    """(n,) class of denoise."""
+    true_class: NDArray[np.uint8]
+    instance: NDArray[np.uint16]
+    """(n,) number of the object, 0 for none."""
+    starts: NDArray[np.int64]
+    """(m + 1,) first point of each scan."""
+    stamp_ns: NDArray[np.int64]
+    poses: Mapping[str, F8]
+    """(m, 4, 4) poses of the LiDAR by name of the set; each starts near its origin."""
+    kinds: Mapping[int, str]
+    """What the objects are, by number."""
+    files: Mapping[str, Sequence[str]]
+    """Where the products lie, by name."""
+    objects: bool
+
+    def __len__(self) -> int:
+        """Number of scans."""
+        return len(self.starts) - 1
+
+    def scan(self, index: int) -> slice:
+        """Rows of a scan."""
+        return slice(int(self.starts[index]), int(self.starts[index + 1]))
+
+    def placed(self, poses: str) -> NDArray[np.float32]:
+        """All points (n, 3) in the map of these poses, m."""
+        out = np.empty(self.points.shape, np.float32)
+        for k, T in enumerate(self.poses[poses]):
+            rows = self.scan(k)
+            out[rows] = self.points[rows].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+        return out
+
+
+def scene(place: Place, store: Path, kept: Path) -> Scene:
+    """Run what is missing of the workflow and gather the points, unless that was done before.
+
+    Raises
+    ------
+    ScanloomError : a stage failed.
+    """
+    result = produced(place.drive, MADE, store)
+    folder = kept / f"{place.drive.name}-{_digest(result)}"
+    if not (folder / "scene.json").exists():
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        _gather(place, result, folder)
+    return _opened(place, folder)
+
+
+def _digest(result: Result) -> str:
+    read = (*MADE, TruthLog)
+    digests = sorted(
+        part.digest for _, artifact in result.artifacts for product in read for part in artifact.of(product)
+    )
+    return hashlib.sha256("".join(digests).encode()).hexdigest()[:16]
+
+
+def _gather(place: Place, result: Result, folder: Path) -> None:
+    """Write the arrays; the description comes last, so that a folder with one is whole."""
+    poses: Poses = result.parts(Poses)[0]
+    T = _near_origin(poses.T_world_lidar)
+    np.save(folder / f"T_{ESTIMATED}.npy", T)
+    np.save(folder / "stamp_ns.npy", poses.stamp_ns)
+    if TRUE in place.poses:
+        truth = result.parts(Truth)[0]
+        within = np.clip(poses.stamp_ns, truth.stamp_ns[0], truth.stamp_ns[-1])
+        true = interpolate_poses(truth.stamp_ns, truth.T_truth_lidar, within)
+        np.save(folder / f"T_{TRUE}.npy", _near_origin(true))
+        kinds = _simulated(result, folder)
+    else:
+        kinds = _measured(place, result, folder, T)
+    files = {p.NAME: [str(path) for _, path in result.files(p)] for p in (*MADE, TruthLog)}
+    described = {"kinds": kinds, "files": files}
+    (folder / "scene.json").write_text(json.dumps(described, indent=1) + "\n")
+
+
+def _near_origin(T: F8) -> F8:
+    """The same poses in a frame that starts where they do, so that float32 holds millimetres."""
+    moved = np.array(T, np.float64)
+    moved[:, :3, 3] -= np.floor(moved[0, :3, 3])
+    return moved
+
+
+def _simulated(result: Result, folder: Path) -> dict[int, str]:
+    """Points with the simulator's own truth; what its objects are."""
+    (log,) = (path for _, path in result.files(TruthLog))
+    true = iter(TruePoints.open(log / "points.parquet"))
+    _write(
+        folder,
+        ((scan, labels, _same(scan, next(true))) for scan, labels in scans_of(result)),
+    )
+    objects = log / "objects.parquet"
+    if not objects.exists():
+        return {}
+    listed = TrueObjects.open(objects)
+    return {int(n): str(what) for n, what in zip(listed.instance, listed.what)}
+
+
+def _same(scan: DeskewedScan, true: TrueLabels) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+    if len(scan) != len(true) or scan.scan_index != true.scan_index:
+        raise SystemExit(f"truth of scan {true.scan_index} is not that of scan {scan.scan_index}")
+    return true.class_, true.instance
+
+
+def _measured(place: Place, result: Result, folder: Path, T: F8) -> dict[int, str]:
+    """Points with boxes as truth: what is in none is not judged."""
+    assert place.drive.folder is not None
+    tracks: list[BoxTrack] = read_boxes(place.drive.folder / LABELS, T)
+    rows = ((scan, labels, boxed(scan, tracks, UNJUDGED)) for scan, labels in scans_of(result))
+    _write(folder, rows)
+    return {
+        track.number: f"{'moving' if track.moving else 'parked'} {track.what.lower()}" for track in tracks
+    }
+
+
+def scans_of(result: Result) -> Iterator[tuple[DeskewedScan, ScanLabels]]:
+    """Scan by scan with the labels of denoise."""
+    for chunk, labels in zip(result.parts(Deskewed), result.parts(Labels)):
+        yield from zip(chunk, labels)
+
+
+Row = tuple[DeskewedScan, ScanLabels, tuple[NDArray[np.uint8], NDArray[np.uint16]]]
+
+
+def _write(folder: Path, rows: Iterator[Row]) -> None:
+    columns: dict[str, list[NDArray[Any]]] = {
+        name: [] for name in ("points", "labels", "true_class", "instance")
+    }
+    for scan, labels, (true_class, instance) in rows:
+        counts = ~np.isin(labels.class_, LEFT_OUT)
+        columns["points"].append(scan.points()[counts])
+        columns["labels"].append(labels.class_[counts])
+        columns["true_class"].append(true_class[counts])
+        columns["instance"].append(instance[counts])
+    sizes = [len(part) for part in columns["labels"]]
+    np.save(folder / "starts.npy", np.concatenate(([0], np.cumsum(sizes))).astype(np.int64))
+    for name, parts in columns.items():
+        np.save(folder / f"{name}.npy", np.concatenate(parts))
+
+
+def _opened(place: Place, folder: Path) -> Scene:
+    described = json.loads((folder / "scene.json").read_text())
+
+    def array(name: str) -> NDArray[Any]:
+        return np.asarray(np.load(folder / f"{name}.npy", mmap_mode="r"))
+
+    return Scene(
+        name=place.drive.name,
+        title=place.drive.title,
+        folder=folder,
+        points=array("points"),
+        labels=array("labels"),
+        true_class=array("true_class"),
+        instance=array("instance"),
+        starts=array("starts"),
+        stamp_ns=array("stamp_ns"),
+        poses={name: array(f"T_{name}") for name in place.poses},
+        kinds={int(number): what for number, what in described["kinds"].items()},
+        files=described["files"],
+        objects=place.objects,
+    )
