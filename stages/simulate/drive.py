@@ -11,6 +11,7 @@ import numpy as np
 from scanloom.schemas.scans import TrueLabels, TruePoints
 from scanloom.schemas.trajectory import Truth
 from scanloom.stages.geometry.geodesy import georeference
+from scanloom.stages.simulate.busy import build_guests, giving_way
 from scanloom.stages.simulate.estate import build_estate
 from scanloom.stages.simulate.gnss import GnssTrack, gnss_track
 from scanloom.stages.simulate.motion import Motion, build_motion
@@ -21,7 +22,7 @@ from scanloom.stages.simulate.settings import Settings
 from scanloom.stages.simulate.sweeping import Lidar, Sweep, scene_of
 from scanloom.stages.simulate.town import Town, build_town
 from scanloom.stages.simulate.tracks import imu_track, wheel_track
-from scanloom.stages.simulate.traffic import Mover, build_traffic
+from scanloom.stages.simulate.traffic import CONVOY, Mover, build_traffic
 from scanloom.stages.simulate.truths import true_fixes, true_objects, true_tracks
 from scanloom.stages.simulate.weather import build_weather
 
@@ -45,7 +46,7 @@ class Drive:
         town = self._town()
         path = town.path
         motion = build_motion(s, path)
-        movers = build_traffic(s, path, motion)
+        movers = self._movers_of(town, motion)
         lidar = Lidar(s, town, motion, movers, build_weather(s, path, motion, movers))
         gnss_settings = s if s.gnss else s.model_copy(update={"duration_s": 0.0})
         gnss = gnss_track(gnss_settings, motion, scene_of(town.triangles()[0]))
@@ -66,6 +67,15 @@ class Drive:
         if s.route == "roundabout":
             town.path = build_path(ring(), town.terrain)
         return town
+
+    def _movers_of(self, town: Town, motion: Motion) -> list[Mover]:
+        """Everybody on the road; on a busy day more, and the others give way."""
+        actors = build_traffic(self.settings, town.path, motion)
+        if not self.settings.busy:
+            return [*actors]
+        convoy = [actor for actor in actors if actor.name in CONVOY]
+        guests = build_guests(self.settings, town, motion, convoy)
+        return [*giving_way(self.settings, town.path, actors, guests), *guests]
 
     def write_metadata(self, stream: IO[bytes]) -> None:
         stream.write(self._recorder.metadata())

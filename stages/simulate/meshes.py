@@ -272,3 +272,33 @@ def cyclist() -> Mesh:
     parts += [box([x - 0.33, -0.02, 0], [x + 0.33, 0.02, 0.66], Material.RUBBER) for x in (-0.52, 0.52)]
     parts.append(cylinder([-0.5, 0, 0.35], [0.5, 0, 0.8], 0.03, Material.METAL, 5))
     return joined(parts)
+
+
+def bus() -> Mesh:
+    parts = [
+        box([-5.6, -1.25, 0.35], [5.6, 1.25, 1.2], Material.PAINT_LIGHT),
+        box([-5.55, -1.22, 1.2], [5.55, 1.22, 2.4], Material.GLASS),
+        box([-5.6, -1.25, 2.4], [5.6, 1.25, 3.0], Material.PAINT_LIGHT, 0.98),
+    ]
+    parts += [box([x - 0.06, y - 0.02, 1.2], [x + 0.06, y + 0.02, 2.4], Material.PAINT_DARK)
+              for x in np.arange(-5.2, 5.3, 1.3) for y in (-1.23, 1.23)]  # fmt: skip
+    for x in (-3.4, 2.9):
+        parts += [box([x - 0.5, y - 0.15, 0], [x + 0.5, y + 0.15, 1.0], Material.RUBBER) for y in (-1.1, 1.1)]
+    return joined(parts)
+
+
+def dog() -> Mesh:
+    parts = [box([-0.3, -0.11, 0.26], [0.3, 0.11, 0.52], Material.CLOTH, 0.9)]
+    parts.append(ball([0.4, 0, 0.58], [0.14, 0.09, 0.1], Material.CLOTH))
+    parts += [box([x - 0.03, y - 0.03, 0], [x + 0.03, y + 0.03, 0.27], Material.CLOTH)
+              for x in (-0.25, 0.25) for y in (-0.07, 0.07)]  # fmt: skip
+    return joined(parts)
+
+
+def pram() -> Mesh:
+    parts = [box([-0.4, -0.22, 0.45], [0.4, 0.22, 0.8], Material.CLOTH, 1.1)]
+    parts.append(cylinder([-0.4, 0, 0.75], [-0.7, 0, 1.0], 0.02, Material.METAL, 5))
+    parts.append(ball([0.2, 0, 0.85], [0.25, 0.22, 0.25], Material.CLOTH))
+    parts += [box([x - 0.13, y - 0.02, 0], [x + 0.13, y + 0.02, 0.26], Material.RUBBER)
+              for x in (-0.3, 0.3) for y in (-0.25, 0.25)]  # fmt: skip
+    return joined(parts)

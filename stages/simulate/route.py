@@ -178,11 +178,16 @@ def _speed_limit(settings: Settings, path: Path) -> F8:
     return v
 
 
+def light_arc(path: Path) -> float:
+    """Where the vehicle waits at the light on South Street, m."""
+    return path.nearest(77.0, -LANE_M)
+
+
 def _stops(settings: Settings, path: Path) -> list[tuple[float, float]]:
     """Arc length and time of rest: the light on South Street on the first pass, and where the bridge street ends."""
     if settings.route != "town":
         return []
-    light, give_way = path.nearest(77.0, -LANE_M), path.nearest(BRIDGE_X - LANE_M, 11.0)
+    light, give_way = light_arc(path), path.nearest(BRIDGE_X - LANE_M, 11.0)
     laps = int((settings.start_m + settings.duration_s * settings.top_speed_m_s) / path.length_m) + 2
     stops = [
         (lap * path.length_m + s, rest) for lap in range(laps) for s, rest in ((light, 6.0), (give_way, 3.0))

@@ -53,6 +53,11 @@ class Settings(BaseModel):
     dust_per_m: float = Field(
         0.25, ge=0.0, le=5.0, description="extinction of fresh dust behind the truck, 1/m"
     )
+    busy: bool = Field(
+        False,
+        description="more traffic: a car that waits at a light and leaves, one that comes to park, one that leaves its bay, "
+        "a bus, a cyclist by the kerb, people who stand and walk on, with a dog and with a pram along a wall",
+    )
     snow_per_m: float = Field(
         0.0,
         ge=0.0,

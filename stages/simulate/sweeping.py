@@ -172,6 +172,8 @@ class Lidar:
         middle = times[[len(times) // 2]]
         centre_ray = origin[len(origin) // 2]
         for number, (actor, (scene, material)) in enumerate(zip(self._actors, self._bodies), start=1):
+            if not actor.present(middle)[0]:
+                continue
             to_actor = actor.poses(self._town.path, middle)[0, :3, 3] - centre_ray
             reach = float(np.linalg.norm(actor.mesh.vertices, axis=1).max()) + 2.5
             if np.linalg.norm(to_actor) > self._settings.max_range_m + reach:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scanloom.schemas.scans import PointClass
 from scanloom.stages.geometry.se3 import F8, pose
@@ -20,6 +21,8 @@ ONCOMING_M = 2 * LANE_M
 """Offset of the other lane to the left, m."""
 PAVEMENT_M = -5.0
 CLEARANCE_M = 2.1
+CONVOY = ("truck", "car behind")
+"""They drive as the vehicle does."""
 LEAD_S = 4.0
 """The truck drives this far ahead, s."""
 DUST_AGES_S = np.arange(0.35, 3.0, 0.4)
@@ -48,6 +51,9 @@ class Mover(Protocol):
     def kind(self, t: float) -> PointClass:
         """What its points truly are at a time."""
 
+    def present(self, t: F8) -> NDArray[np.bool_]:
+        """Whether it is there at times (n,) s."""
+
 
 @dataclass(frozen=True)
 class Actor:
@@ -64,6 +70,9 @@ class Actor:
 
     def kind(self, t: float) -> PointClass:
         return PointClass.DYNAMIC
+
+    def present(self, t: F8) -> NDArray[np.bool_]:
+        return np.ones(len(t), bool)
 
     def poses(self, path: Path, t: F8) -> F8:
         """T_world_actor (n, 4, 4)."""

@@ -57,7 +57,10 @@ def true_tracks(
     tracks = [_track(mover, path, t) for mover in movers]
     points = [np.bincount(instance, minlength=65536)[numbers] for instance in seen]
     boxes = np.stack(tracks, axis=1).reshape(-1, 8) if tracks else np.empty((0, 8))
-    return TrueTracks(
+    there = (
+        np.stack([mover.present(t) for mover in movers], axis=1) if movers else np.empty((len(t), 0), bool)
+    )
+    rows = TrueTracks(
         scan_index=np.repeat(np.arange(len(seen)), len(movers)),
         instance=np.tile(numbers, len(seen)).astype(np.uint16),
         what=np.array([mover.what for mover in movers] * len(seen), object),
@@ -72,6 +75,7 @@ def true_tracks(
         height_m=boxes[:, 6],
         speed_m_s=boxes[:, 7],
     )
+    return rows.take(there.reshape(-1))
 
 
 def _track(mover: Mover, path: Path, t: NDArray[np.float64]) -> NDArray[np.float64]:
