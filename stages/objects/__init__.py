@@ -1,1 +1,6 @@
-"""Objects: vehicles found in the scans and followed."""
+"""Objects: tracks of what moves."""
+
+from scanloom.stages.objects.settings import Settings
+from scanloom.stages.objects.stage import VERSION, objects
+
+__all__ = ["VERSION", "Settings", "objects"]

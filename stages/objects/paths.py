@@ -1,0 +1,200 @@
+"""A track as a whole, once it has ended: one size for all its boxes, a smooth path, and whether and when it moved.
+
+Boxes are laid out again with the final size, from the side that was seen, so that a box of which more was seen later
+does not seem to move. What stands before it moves is dynamic from the first scan on; what stands to the end of its track
+for longer than `parked_s` is not dynamic once it stands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.schemas.objects import ObjectClass
+from scanloom.stages.geometry.kernels import kernel
+from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.objects import filter as kalman
+from scanloom.stages.objects.settings import Settings
+from scanloom.stages.objects.tracker import History
+
+B1 = NDArray[np.bool_]
+
+SEEN = kalman.STATE
+FULL_TURN = 2.0 * np.pi
+HEADING_M_S = 1.0
+REST_M = 0.5
+TOP_MARGIN_M = 0.1
+PERSON_M, CYCLIST_M, CYCLIST_WIDTH_M, TRUCK_M = 1.1, 2.4, 1.2, 6.5
+PERSON_M_S = 3.0
+
+
+@dataclass(frozen=True)
+class ObjectPath:
+    """Boxes of one track in level axes of the odometry, one per scan from its first to its last."""
+
+    rows: NDArray[np.int64]
+    """(n,) rows of the odometry."""
+    xyz: F8
+    """(n, 3) middle of the foot, m."""
+    yaw: F8
+    size: F8
+    """(3,) length, width, height, m."""
+    speed_m_s: F8
+    dynamic: B1
+    kind: ObjectClass
+    score: float
+
+
+def object_path(settings: Settings, history: History, scan_index: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> ObjectPath | None:  # fmt: skip
+    """The path of a track that moved, or None; scans and their stamps are those of the odometry."""
+    score = history.through / max(history.through + history.taken, 1)
+    if len(history.scans) < settings.min_scans or history.scans_through < settings.min_scans:
+        return None
+    if score < settings.min_score:
+        return None
+    seen = _upright(np.array(history.rows))
+    size = _final_size(seen)
+    first, last = np.searchsorted(scan_index, [history.scans[0], history.scans[-1]])
+    rows = np.arange(first, last + 1)
+    place = np.searchsorted(scan_index, history.scans) - first
+    t = (stamp_ns[rows] - stamp_ns[first]) * 1e-9
+    measured, R = _measured(seen, size, place, len(rows))
+    path, variance = smooth(t, measured, R)
+    moved = _moved(settings, path, variance)
+    if not moved:
+        return None
+    speed = np.hypot(path[:, 2], path[:, 3])
+    yaw = _yaw(seen[:, kalman.YAW], place, path, speed, size)
+    z = np.interp(t, t[place], seen[:, kalman.FOOT])
+    return ObjectPath(
+        rows=rows,
+        xyz=np.column_stack((path[:, :2], z)),
+        yaw=yaw,
+        size=size,
+        speed_m_s=speed,
+        dynamic=_dynamic(settings, t, path),
+        kind=_kind(size, speed),
+        score=score,
+    )
+
+
+def _upright(rows: F8) -> F8:
+    """The rows with the axes that the track had in the end, where they were once turned by a quarter."""
+    out = rows.copy()
+    quarters = np.round(np.diff(out[:, kalman.YAW]) / (0.5 * np.pi)).astype(int)
+    owed = np.concatenate((np.cumsum(quarters[::-1])[::-1], [0]))
+    odd = owed % 2 != 0
+    out[:, kalman.YAW] += 0.5 * np.pi * owed
+    lw = [kalman.LENGTH, kalman.WIDTH]
+    out[np.ix_(odd, lw)] = out[np.ix_(odd, lw[::-1])]
+    grows = out[:, [SEEN + kalman.GROWS_U, SEEN + kalman.GROWS_V]]
+    for turned in range(4):
+        at = owed % 4 == turned
+        u, v = grows[at, 0], grows[at, 1]
+        out[at, SEEN + kalman.GROWS_U] = (u, v, -u, -v)[turned]
+        out[at, SEEN + kalman.GROWS_V] = (v, -u, -v, u)[turned]
+    return out
+
+
+def _final_size(rows: F8) -> F8:
+    """Length, width and height of the box as the track knew them in the end."""
+    return np.array(
+        [rows[-1, kalman.LENGTH], rows[-1, kalman.WIDTH], rows[:, kalman.HEIGHT].max() + TOP_MARGIN_M]
+    )
+
+
+def _measured(rows: F8, size: F8, place: NDArray[np.int64], count: int) -> tuple[F8, F8]:
+    """Middles (count, 2) of a box of the final size, NaN where it was not seen, and their covariances (count, 2, 2)."""
+    grow = 0.5 * (size[:2] - rows[:, [kalman.LENGTH, kalman.WIDTH]])
+    u = grow[:, 0] * rows[:, SEEN + kalman.GROWS_U]
+    v = grow[:, 1] * rows[:, SEEN + kalman.GROWS_V]
+    c, s = np.cos(rows[:, kalman.YAW]), np.sin(rows[:, kalman.YAW])
+    middle = np.full((count, 2), np.nan)
+    middle[place, 0] = rows[:, SEEN + kalman.MEASURED_X] + c * u - s * v
+    middle[place, 1] = rows[:, SEEN + kalman.MEASURED_Y] + s * u + c * v
+    R = np.tile(np.eye(2), (count, 1, 1))
+    R[place, 0, 0], R[place, 1, 1] = rows[:, SEEN + kalman.R_XX], rows[:, SEEN + kalman.R_YY]
+    R[place, 0, 1] = R[place, 1, 0] = rows[:, SEEN + kalman.R_XY]
+    return middle, R
+
+
+@kernel
+def smooth(t: F8, measured: F8, R: F8) -> tuple[F8, F8]:
+    """Rauch-Tung-Striebel smoother of constant velocity: states (n, 4) and variances (n, 4) at times t, s, from places
+    (n, 2), NaN where there is none, and their covariances (n, 2, 2)."""
+    n = len(t)
+    x, C = np.zeros((n, 4)), np.zeros((n, 4, 4))
+    ahead, D = np.zeros((n, 4)), np.zeros((n, 4, 4))
+    q = kalman.ACCELERATION_M_S2**2
+    x[0, :2] = measured[0]
+    C[0] = np.diag(np.array([R[0, 0, 0], R[0, 1, 1], kalman.FIRST_SPEED_M_S**2, kalman.FIRST_SPEED_M_S**2]))
+    for k in range(1, n):
+        F, Q = _step(t[k] - t[k - 1], q)
+        ahead[k] = F @ x[k - 1]
+        D[k] = F @ C[k - 1] @ F.T + Q
+        x[k], C[k] = ahead[k], D[k]
+        if np.isfinite(measured[k, 0]):
+            gain = np.ascontiguousarray(D[k][:, :2]) @ np.linalg.inv(D[k][:2, :2] + R[k])
+            x[k] = x[k] + gain @ (measured[k] - ahead[k, :2])
+            C[k] = C[k] - gain @ np.ascontiguousarray(D[k][:2, :])
+    for k in range(n - 2, -1, -1):
+        F, _ = _step(t[k + 1] - t[k], q)
+        G = C[k] @ F.T @ np.linalg.inv(D[k + 1])
+        x[k] = x[k] + G @ (x[k + 1] - ahead[k + 1])
+        C[k] = C[k] + G @ (C[k + 1] - D[k + 1]) @ G.T
+    variance = np.empty((n, 4))
+    for k in range(n):
+        variance[k] = np.diag(C[k])
+    return x, variance
+
+
+@kernel
+def _step(dt: float, q: float) -> tuple[F8, F8]:
+    F, Q = np.eye(4), np.zeros((4, 4))
+    for k in range(2):
+        F[k, k + 2] = dt
+        Q[k, k] = q * dt**4 / 4
+        Q[k, k + 2] = Q[k + 2, k] = q * dt**3 / 2
+        Q[k + 2, k + 2] = q * dt**2
+    return F, Q
+
+
+def _moved(settings: Settings, path: F8, variance: F8) -> bool:
+    """Whether the path leads farther than its uncertainty explains."""
+    low, high = path[:, :2].min(axis=0), path[:, :2].max(axis=0)
+    sigma = float(np.sqrt(np.median(variance[:, :2].max(axis=1))))
+    return float(np.hypot(*(high - low))) > max(settings.min_displacement_m, settings.min_sigmas * sigma)
+
+
+def _yaw(seen: F8, place: NDArray[np.int64], path: F8, speed: F8, size: F8) -> F8:
+    """Yaw (n,) of the box: that of its shape, turned to where it drives; small things look where they go."""
+    n = len(path)
+    heading = np.unwrap(np.arctan2(path[:, 3], path[:, 2]))
+    fast = speed > HEADING_M_S
+    if size[:2].max() <= PERSON_M:
+        going = np.flatnonzero(fast if fast.any() else speed >= speed.max())
+        return np.asarray(np.interp(np.arange(n), going, np.unwrap(heading[going])))
+    yaw = np.interp(np.arange(n), place, np.unwrap(seen, period=np.pi))
+    forward = np.sum(speed * np.cos(heading - yaw))
+    return yaw if forward >= 0.0 else yaw + np.pi
+
+
+def _dynamic(settings: Settings, t: F8, path: F8) -> B1:
+    """All rows but those after it came to rest for good."""
+    apart = np.hypot(*(path[:, :2] - path[-1, :2]).T)
+    last = int(np.flatnonzero(apart > REST_M).max(initial=0))
+    moving = np.ones(len(t), bool)
+    if t[-1] - t[last] > settings.parked_s:
+        moving[last + 1 :] = False
+    return moving
+
+
+def _kind(size: F8, speed: F8) -> ObjectClass:
+    long, wide = max(size[0], size[1]), min(size[0], size[1])
+    if long <= PERSON_M:
+        return ObjectClass.PERSON if np.quantile(speed, 0.8) < PERSON_M_S else ObjectClass.CYCLIST
+    if long <= CYCLIST_M and wide <= CYCLIST_WIDTH_M:
+        return ObjectClass.CYCLIST
+    return ObjectClass.TRUCK if long > TRUCK_M else ObjectClass.VEHICLE
