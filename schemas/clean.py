@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.schemas.product import Stream, Table, attribute, column
-from scanloom.schemas.scans import ScanLabels
+from scanloom.schemas.scans import PointClass, ScanLabels
 
 BRICK_SIDE = 8
 BRICK_VOXELS = BRICK_SIDE**3
@@ -80,3 +80,18 @@ class FinalLabels(Stream[ScanLabels]):
 
     NAME = "final_labels"
     ITEM = ScanLabels
+
+
+@dataclass(frozen=True)
+class ClassCounts(Table):
+    """How many points of each class a chunk has. One row per scan."""
+
+    NAME: ClassVar[str] = "class_counts"
+
+    scan_index: NDArray[np.int64] = column("i8", "number of the scan in its session")
+    points: NDArray[np.int64] = column(
+        "i8", "points of each PointClass, by its value", shape=(len(PointClass),)
+    )
+    before: NDArray[np.int64] = column(
+        "i8", "the same as denoise had them, before the map was asked", shape=(len(PointClass),)
+    )

@@ -9,6 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.schemas.product import Files, Table, attribute, column
+from scanloom.schemas.scans import PointClass
+
+LEFT_OUT = (PointClass.DYNAMIC, PointClass.AIRBORNE, PointClass.OUTLIER, PointClass.CHANGED)
+"""Classes of points that are left out of the map and kept beside it, in the order of their rows."""
+RANK_SHIFT = 39
+"""In a piece's `voxel` a 0 above this bit stands for points of the map, n for those of `LEFT_OUT[n - 1]`."""
 
 
 @dataclass(frozen=True)
@@ -16,12 +22,14 @@ class Piece(Table):
     """What one chunk adds to one tile: sums per voxel, to be merged. One part per tile, keyed `X_Y`."""
 
     NAME: ClassVar[str] = "piece"
-    SCHEMA_VERSION: ClassVar[int] = 2
+    SCHEMA_VERSION: ClassVar[int] = 3
     ON_THE_WAY: ClassVar[bool] = True
     SPLIT_BY: ClassVar[str] = "tile"
 
     voxel: NDArray[np.int64] = column(
-        "i8", "voxel from the tile's corner, x 2^29 + y 2^19 + z + 2^18; rows are ordered by it"
+        "i8",
+        "voxel from the tile's corner, x 2^29 + y 2^19 + z + 2^18, plus 2^39 for each step in `LEFT_OUT`; rows are "
+        "ordered by it",
     )
     count: NDArray[np.int32] = column("i4", "points summed")
     sum_x_m: NDArray[np.float64] = column("f8", "sum of x from the tile's corner", unit="m")
@@ -51,7 +59,9 @@ class Tile(Table):
     )
     z_m: NDArray[np.float32] = column("f4", "from the tile's origin, up", unit="m", frame="tile")
     intensity: NDArray[np.float32] = column("f4", "mean intensity of the voxel's points")
-    class_: NDArray[np.uint8] = column("u1", "a value of PointClass: ground or static")
+    class_: NDArray[np.uint8] = column(
+        "u1", "a value of PointClass: ground or static; else in a removed tile"
+    )
     count: NDArray[np.int32] = column("i4", "points averaged")
     offset_m: tuple[float, ...] = attribute("add to the coordinates to get the map's frame, doubles, m")
     frame: str = attribute("`world` or `map`")
@@ -59,6 +69,13 @@ class Tile(Table):
     voxel_size_m: float = attribute("edge of a voxel, m")
     tile_size_m: float = attribute("edge of a tile, m")
     sessions: tuple[str, ...] = attribute("sessions that contributed")
+
+
+@dataclass(frozen=True)
+class RemovedTile(Tile):
+    """Points of one tile that are left out of the map, as a tile: one point per voxel and class. One part per tile."""
+
+    NAME: ClassVar[str] = "removed_tile"
 
 
 @dataclass(frozen=True)
@@ -94,6 +111,9 @@ class TileIndex(Table):
 
 @dataclass(frozen=True)
 class MapFiles(Files):
-    """The whole map as one cloud: `map.ply`, local coordinates, offset and CRS in its comments."""
+    """The whole map as one cloud, local coordinates, offset and CRS in its comments.
+
+    `map.ply`, and `removed.ply` with what was left out of it, each point with its class.
+    """
 
     NAME: ClassVar[str] = "map_files"

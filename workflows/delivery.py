@@ -132,6 +132,7 @@ def change_rows(result: Result) -> list[Metric]:
 def _items(result: Result) -> Iterable[Item]:
     for _, path in result.files(MapFiles):
         yield Item("map.ply", path / "map.ply")
+        yield Item("removed.ply", path / "removed.ply")
     for coordinate, path in result.files(Tile):
         yield Item(f"tiles/{dict(coordinate)['tile']}.parquet", path)
     for coordinate, path in result.files(TileFiles):

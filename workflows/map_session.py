@@ -5,18 +5,21 @@ from __future__ import annotations
 from scanloom.pipeline.node import Node, node
 from scanloom.schemas.base import Base, BaseLog
 from scanloom.schemas.changes import ChangeFiles, Changes
+from scanloom.schemas.clean import ClassCounts, Cleared, FinalLabels, Rays
 from scanloom.schemas.evaluation import ErrorTrack, Metrics, PictureFiles, ReportFiles
 from scanloom.schemas.loops import Loops, Places
+from scanloom.schemas.objects import ObjectTracks
 from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.scans import Deskewed, Labels, Scans
 from scanloom.schemas.session import RawLog, Session, TruthLog
-from scanloom.schemas.tiles import MapFiles, Piece, Tile, TileFiles, TileIndex
+from scanloom.schemas.tiles import MapFiles, Piece, RemovedTile, Tile, TileFiles, TileIndex
 from scanloom.schemas.tracks import Gnss, Imu, Wheel
 from scanloom.schemas.trajectory import Odometry, Poses, Truth
 from scanloom.schemas.windows import Track, TrackEnds, Window
 from scanloom.stages.base import base
 from scanloom.stages.changes import changes
+from scanloom.stages.clean import clean, rays, relabel
 from scanloom.stages.denoise import denoise
 from scanloom.stages.deskew import deskew
 from scanloom.stages.evaluation import evaluation
@@ -24,6 +27,7 @@ from scanloom.stages.fusion import fusion
 from scanloom.stages.ingest import ingest
 from scanloom.stages.loops.closing import loops
 from scanloom.stages.loops.places import places
+from scanloom.stages.objects import objects
 from scanloom.stages.odometry import odometry
 from scanloom.stages.odometry.tracking import track
 from scanloom.stages.odometry.windows import windows
@@ -48,13 +52,17 @@ NODES: tuple[Node, ...] = (
     node("windows",    windows,    per="session", reads=(Scans,),                              writes=Window, settings="odometry"),
     node("track",      track,      per="window",  reads=(Window, Deskewed, Labels, Session, Imu, Wheel, SensorCheck), writes=(Track, TrackEnds), settings="odometry"),
     node("odometry",   odometry,   per="session", reads=(Deskewed, Labels, Session, Imu, Wheel, SensorCheck, Track, TrackEnds), writes=Odometry),
+    node("objects",    objects,    per="session", reads=(Deskewed, Labels, Session, Odometry), writes=ObjectTracks),
     node("places",     places,     per="chunk",   reads=(Deskewed, Labels, Odometry),          writes=Places),
     node("loops",      loops,      per="map",     reads=(Deskewed, Labels, Odometry, Places),  writes=Loops),
     node("fusion",     fusion,     per="map",     reads=(Session, Odometry, Loops, Gnss, Imu, Wheel, SensorCheck, Base), writes=(Poses, Graph)),
-    node("tiling",     tiling,     per="chunk",   reads=(Deskewed, Labels, Poses),             writes=Piece),
-    node("changes",    changes,    per="map",     reads=(Base, Poses, Deskewed, Labels, Piece), writes=(Changes, ChangeFiles)),
-    node("tiles",      tiles,      per="tile",    reads=(Piece,),                              writes=(Tile, TileFiles)),
-    node("overview",   overview,   per="map",     reads=(Tile,),                               writes=(TileIndex, MapFiles)),
+    node("rays",       rays,       per="chunk",   reads=(Deskewed, Labels, Poses),             writes=Rays),
+    node("clean",      clean,      per="tile",    reads=(Rays,),                               writes=Cleared),
+    node("relabel",    relabel,    per="chunk",   reads=(Deskewed, Labels, Cleared, Poses),    writes=(FinalLabels, ClassCounts)),
+    node("tiling",     tiling,     per="chunk",   reads=(Deskewed, FinalLabels, Poses),        writes=Piece),
+    node("changes",    changes,    per="map",     reads=(Base, Poses, Deskewed, FinalLabels, Piece), writes=(Changes, ChangeFiles)),
+    node("tiles",      tiles,      per="tile",    reads=(Piece,),                              writes=(Tile, RemovedTile, TileFiles)),
+    node("overview",   overview,   per="map",     reads=(Tile, RemovedTile),                   writes=(TileIndex, MapFiles)),
     node("evaluation", evaluation, per="map",     reads=(Session, Truth, Odometry, Poses, Loops, Graph, Gnss, Tile, SensorCheck), writes=(Metrics, ErrorTrack)),
     node("picture",    picture,    per="map",     reads=(Poses, Loops, Graph, TileIndex, Tile), writes=PictureFiles),
     node("report",     report,     per="map",     reads=(Session, Metrics, ErrorTrack, Odometry, Poses, Loops, Graph, TileIndex, PictureFiles, SensorCheck, Changes), writes=ReportFiles),

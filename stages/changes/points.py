@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
-from scanloom.schemas.tiles import Piece
+from scanloom.schemas.scans import PointClass
+from scanloom.schemas.tiles import LEFT_OUT, RANK_SHIFT, Piece
 from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.geometry.voxels import downsample
 
@@ -20,7 +22,8 @@ def standing_points(tile: str, pieces: Sequence[Piece], thinning_m: float, clear
     Those less than `clearance_m` above the lowest point of their column are left out as well: far from the road not all
     ground is known as such, and rays that graze it see through it.
     """
-    voxel = np.concatenate([piece.voxel for piece in pieces])
+    pieces = [piece.take(_stood(piece)) for piece in pieces]
+    voxel = np.concatenate([piece.voxel & ((1 << RANK_SHIFT) - 1) for piece in pieces])
     order = np.argsort(voxel, kind="stable")
     starts = np.flatnonzero(np.diff(voxel[order], prepend=-1))
 
@@ -38,6 +41,12 @@ def standing_points(tile: str, pieces: Sequence[Piece], thinning_m: float, clear
     places = sums / count[:, None]
     points = (places + corner)[standing & (_above_lowest(places) >= clearance_m)]
     return np.ascontiguousarray(points[downsample(points - corner, thinning_m)])
+
+
+def _stood(piece: Piece) -> NDArray[np.bool_]:
+    """Rows of the map and of what was taken out of it because it has changed."""
+    rank = piece.voxel >> RANK_SHIFT
+    return np.asarray((rank == 0) | (rank == 1 + LEFT_OUT.index(PointClass.CHANGED)))
 
 
 def _above_lowest(places: F8) -> F8:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from scanloom.schemas.clean import Cleared, FinalLabels, Standing
+from scanloom.schemas.clean import ClassCounts, Cleared, FinalLabels, Standing
 from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
 from scanloom.schemas.trajectory import Poses
@@ -26,6 +26,7 @@ VERSION = 1
 
 U1 = NDArray[np.uint8]
 B1 = NDArray[np.bool_]
+I8 = NDArray[np.int64]
 JUDGED = (PointClass.UNLABELLED, PointClass.STATIC)
 
 
@@ -50,23 +51,37 @@ class Settings(BaseModel):
 
 def relabel(
     settings: Settings, deskewed: Deskewed, labels: Labels, cleared: Parts[Cleared], poses: Poses
-) -> FinalLabels:
-    """A class for every point of every scan of a chunk, scan by scan, in the order of the points.
+) -> Iterator[FinalLabels | ClassCounts]:
+    """A class for every point of every scan of a chunk, scan by scan, in the order of the points; then their numbers.
 
     Scans without a pose keep the classes they have.
     """
-    return FinalLabels(_relabelled(settings, deskewed, labels, cleared, poses))
+    counts: list[tuple[int, I8, I8]] = []
+    yield FinalLabels(_relabelled(settings, deskewed, labels, cleared, poses, counts))
+    index, before, after = zip(*counts) if counts else ((), (), ())
+    shape = (len(counts), len(PointClass))
+    yield ClassCounts(
+        scan_index=np.array(index, np.int64),
+        points=np.array(after, np.int64).reshape(shape),
+        before=np.array(before, np.int64).reshape(shape),
+    )
 
 
 def _relabelled(
-    settings: Settings, deskewed: Deskewed, labels: Labels, cleared: Parts[Cleared], poses: Poses
-) -> Iterator[ScanLabels]:
+    settings: Settings, deskewed: Deskewed, labels: Labels, cleared: Parts[Cleared], poses: Poses,
+    counts: list[tuple[int, I8, I8]],
+) -> Iterator[ScanLabels]:  # fmt: skip
     T_of = {int(i): T for i, T in zip(poses.scan_index, poses.T_world_lidar) if np.isfinite(T).all()}
     verdicts, image = Verdicts(cleared), incidence.new_image()
     for scan, label in zip(deskewed, labels, strict=True):
         T = T_of.get(scan.scan_index)
         classes = label.class_ if T is None else final(settings, scan, label.class_, verdicts, T, image)
+        counts.append((scan.scan_index, _counted(label.class_), _counted(classes)))
         yield ScanLabels(class_=classes, reference_ns=label.reference_ns, scan_index=label.scan_index)
+
+
+def _counted(classes: U1) -> I8:
+    return np.bincount(classes, minlength=len(PointClass))[: len(PointClass)]
 
 
 def final(

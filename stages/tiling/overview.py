@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from scanloom.schemas.errors import StageError
 from scanloom.schemas.product import Parts, columns_of
-from scanloom.schemas.tiles import MapFiles, Tile, TileIndex
+from scanloom.schemas.tiles import MapFiles, RemovedTile, Tile, TileIndex
 from scanloom.stages.geometry.voxels import downsample
 from scanloom.stages.tiling import ply
 from scanloom.stages.tiling.grid import tile_position
@@ -28,10 +28,12 @@ class Settings(BaseModel):
     map_voxel_size_m: float = Field(0.2, ge=0.01, le=10.0, description="edge of a voxel of map.ply, m")
 
 
-def overview(settings: Settings, tiles: Parts[Tile]) -> tuple[TileIndex, MapFiles]:
-    """List the tiles with bounds and checksums, and write `map.ply` tile by tile.
+def overview(
+    settings: Settings, tiles: Parts[Tile], removed: Parts[RemovedTile] | None = None
+) -> tuple[TileIndex, MapFiles]:
+    """List the tiles with bounds and checksums, and write `map.ply` and `removed.ply` tile by tile.
 
-    `map.ply` has float32 coordinates from the origin of the map: steps of 0.06 mm at 1 km and 1 mm at 10 km.
+    `removed.ply` has all points that are left out of the map, `map.ply` one point in each coarser voxel. They have float32 coordinates from the origin of the map: steps of 0.06 mm at 1 km and 1 mm at 10 km.
 
     Raises
     ------
@@ -45,13 +47,19 @@ def overview(settings: Settings, tiles: Parts[Tile]) -> tuple[TileIndex, MapFile
     surveys = [_survey(c["tile"], tile, settings.map_voxel_size_m) for c, tile in tiles.items()]
     index = tile_index(surveys, tiles[0])
 
+    comments = ply.georeference_comments(index.frame, index.georeference, (0.0, 0.0, 0.0))
+
     def write_map(stream: IO[bytes]) -> None:
-        comments = ply.georeference_comments(index.frame, index.georeference, (0.0, 0.0, 0.0))
         points = sum(len(survey.coarse) for survey in surveys) // ply.VERTEX.itemsize
         stream.write(ply.header(points, ["scanloom map", *comments]))
         stream.writelines(survey.coarse for survey in surveys)
 
-    return index, MapFiles(contents={"map.ply": write_map})
+    def write_removed(stream: IO[bytes]) -> None:
+        left_out = removed if removed is not None else ()
+        stream.write(ply.header(sum(map(len, left_out)), ["scanloom points left out of the map", *comments]))
+        stream.writelines(_vertices(tile, np.arange(len(tile))) for tile in left_out)
+
+    return index, MapFiles(contents={"map.ply": write_map, "removed.ply": write_removed})
 
 
 @dataclass(frozen=True)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from scanloom.schemas.clean import FinalLabels
 from scanloom.schemas.errors import StageError
-from scanloom.schemas.product import Part
-from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
-from scanloom.schemas.tiles import Piece
+from scanloom.schemas.product import Part, columns_of
+from scanloom.schemas.scans import Deskewed, DeskewedScan, PointClass, ScanLabels
+from scanloom.schemas.tiles import LEFT_OUT, RANK_SHIFT, Piece
 from scanloom.schemas.trajectory import Poses
 from scanloom.stages.tiling.grid import check_grid, tile_name
 from scanloom.stages.tiling.voxel_sums import TileSums, VoxelSums
@@ -43,18 +44,19 @@ class Settings(BaseModel):
         return self
 
 
-def tiling(settings: Settings, deskewed: Deskewed, labels: Labels, poses: Poses) -> Iterator[Part[Piece]]:
-    """Sum the kept points of a chunk per voxel and yield one piece per tile, ordered by tile.
+def tiling(
+    settings: Settings, deskewed: Deskewed, labels: FinalLabels, poses: Poses
+) -> Iterator[Part[Piece]]:
+    """Sum the points of a chunk per voxel and yield one piece per tile, ordered by tile.
 
-    Memory is bounded by the voxels that the chunk fills, not by its points.
+    Points that are left out of the map have rows of their own, one for each voxel and class. Memory is bounded by the voxels that the chunk fills, not by its points.
 
     Raises
     ------
     StageError : labels do not belong to the scans, or no scan of the chunk has a pose.
     """
-    sums = VoxelSums(settings.voxel_size_m, settings.tile_size_m)
+    sums = _Sums(settings)
     pose_of = {int(index): T for index, T in zip(poses.scan_index, poses.T_world_lidar)}
-    keep = _kept(settings.classes)
     seen = placed = 0
     for scan, label in zip(deskewed, labels, strict=True):
         _check_pair(scan, label)
@@ -63,15 +65,50 @@ def tiling(settings: Settings, deskewed: Deskewed, labels: Labels, poses: Poses)
         if T is None or not np.isfinite(T).all():
             continue
         placed += 1
-        xyz = (scan.x_m, scan.y_m, scan.z_m)
-        sums.add(xyz, scan.intensity, label.class_, keep, int(PointClass.GROUND), np.ascontiguousarray(T))
+        sums.add(scan, label.class_, np.ascontiguousarray(T))
     if seen and not placed:
         raise StageError(
             "no scan of this chunk has a pose",
             next_step="look at the odometry of this session: it ended early",
         )
-    for tile in sums.tiles():
-        yield Part(_piece(settings, tile, poses), tile_name(*tile.tile))
+    for tile, parts in sums.tiles():
+        yield Part(_piece(settings, parts, poses), tile_name(*tile))
+
+
+class _Sums:
+    """Sums per voxel: of what enters the map, and of each class that is left out."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._out = tuple(c for c in LEFT_OUT if c not in settings.classes)
+        self._sums: dict[int, tuple[NDArray[np.bool_], VoxelSums]] = {}
+
+    def add(self, scan: DeskewedScan, classes: NDArray[np.uint8], T_world_lidar: NDArray[np.float64]) -> None:
+        xyz = (scan.x_m, scan.y_m, scan.z_m)
+        self._of(0).add(xyz, scan.intensity, classes, self._sums[0][0], int(PointClass.GROUND), T_world_lidar)
+        met = np.bincount(classes, minlength=256)
+        for class_ in self._out:
+            if met[class_]:
+                rank = 1 + LEFT_OUT.index(class_)
+                sums = self._of(rank)
+                sums.add(
+                    xyz, scan.intensity, classes, self._sums[rank][0], int(PointClass.GROUND), T_world_lidar
+                )
+
+    def _of(self, rank: int) -> VoxelSums:
+        if rank not in self._sums:
+            classes = self._settings.classes if rank == 0 else (LEFT_OUT[rank - 1],)
+            sums = VoxelSums(self._settings.voxel_size_m, self._settings.tile_size_m)
+            self._sums[rank] = (_kept(classes), sums)
+        return self._sums[rank][1]
+
+    def tiles(self) -> Iterator[tuple[tuple[int, int], list[tuple[int, TileSums]]]]:
+        """Position of each tile, with its sums by rank, ordered."""
+        found: dict[tuple[int, int], list[tuple[int, TileSums]]] = {}
+        for rank in sorted(self._sums):
+            for tile in self._sums[rank][1].tiles():
+                found.setdefault(tile.tile, []).append((rank, tile))
+        yield from sorted(found.items())
 
 
 def _kept(classes: tuple[PointClass, ...]) -> NDArray[np.bool_]:
@@ -89,16 +126,14 @@ def _check_pair(scan: DeskewedScan, label: ScanLabels) -> None:
         )
 
 
-def _piece(settings: Settings, tile: TileSums, poses: Poses) -> Piece:
+def _piece(settings: Settings, parts: list[tuple[int, TileSums]], poses: Poses) -> Piece:
+    def joined(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(tile, name) for _, tile in parts])
+
+    sums = [name for name in columns_of(Piece) if name != "voxel"]
     return Piece(
-        voxel=tile.voxel,
-        count=tile.count,
-        sum_x_m=tile.sum_x_m,
-        sum_y_m=tile.sum_y_m,
-        sum_z_m=tile.sum_z_m,
-        sum_intensity=tile.sum_intensity,
-        ground_count=tile.ground_count,
-        scan_count=tile.scan_count,
+        voxel=np.concatenate([tile.voxel + (np.int64(rank) << RANK_SHIFT) for rank, tile in parts]),
+        **{name: joined(name) for name in sums},
         frame=poses.frame,
         georeference=poses.georeference,
         voxel_size_m=settings.voxel_size_m,

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scanloom.schemas.errors import StageError
 from scanloom.schemas.product import Parts, columns_of
 from scanloom.schemas.scans import PointClass
-from scanloom.schemas.tiles import Piece, Tile, TileFiles
+from scanloom.schemas.tiles import LEFT_OUT, RANK_SHIFT, Piece, RemovedTile, Tile, TileFiles
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.tiling import ply
 from scanloom.stages.tiling.grid import tile_position
@@ -34,10 +34,10 @@ class Settings(BaseModel):
     )
 
 
-def tiles(settings: Settings, pieces: Parts[Piece]) -> tuple[Tile, TileFiles]:
+def tiles(settings: Settings, pieces: Parts[Piece]) -> tuple[Tile, RemovedTile, TileFiles]:
     """Merge the pieces of one tile: the mean point, mean intensity and majority class of every voxel.
 
-    The sums are exact (see `voxel_sums`), hence the tile does not depend on the order of the pieces.
+    What is left out of the map is averaged likewise, class by class. The sums are exact (see `voxel_sums`), hence the tile does not depend on the order of the pieces.
 
     Raises
     ------
@@ -45,9 +45,12 @@ def tiles(settings: Settings, pieces: Parts[Piece]) -> tuple[Tile, TileFiles]:
     """
     name, sessions = _identity(pieces)
     merged = merge_all(name, pieces)
-    kept = merged.take((merged.count >= settings.min_points) & (merged.scan_count >= settings.min_scans))
-    tile = _average(kept, name, sessions)
-    return tile, TileFiles(contents={"tile.ply": tile_ply(tile)})
+    first_out = int(np.searchsorted(merged.voxel, 1 << RANK_SHIFT))
+    of_map, left_out = merged.take(slice(0, first_out)), merged.take(slice(first_out, None))
+    kept = of_map.take((of_map.count >= settings.min_points) & (of_map.scan_count >= settings.min_scans))
+    tile = Tile(**_average(kept, name, sessions), class_=_scenery(kept))
+    removed = RemovedTile(**_average(left_out, name, sessions), class_=_left_out(left_out))
+    return tile, removed, TileFiles(contents={"tile.ply": tile_ply(tile)})
 
 
 def merge_all(name: str, pieces: Iterable[Piece]) -> Piece:
@@ -110,24 +113,32 @@ def _identity(pieces: Parts[Piece]) -> tuple[str, tuple[str, ...]]:
     return names.pop(), tuple(sorted({c["session"] for c in coordinates if "session" in c}))
 
 
-def _average(sums: Piece, name: str, sessions: tuple[str, ...]) -> Tile:
+def _scenery(sums: Piece) -> NDArray[np.uint8]:
+    ground = 2 * sums.ground_count > sums.count
+    return np.where(ground, PointClass.GROUND, PointClass.STATIC).astype(np.uint8)
+
+
+def _left_out(sums: Piece) -> NDArray[np.uint8]:
+    return np.array([0, *LEFT_OUT], np.uint8)[sums.voxel >> RANK_SHIFT]
+
+
+def _average(sums: Piece, name: str, sessions: tuple[str, ...]) -> dict[str, Any]:
+    """Columns and attributes of a tile but for the class."""
     x, y = tile_position(name)
     count = np.maximum(sums.count, 1)
-    ground = 2 * sums.ground_count > sums.count
-    return Tile(
-        x_m=(sums.sum_x_m / count).astype(np.float32),
-        y_m=(sums.sum_y_m / count).astype(np.float32),
-        z_m=(sums.sum_z_m / count).astype(np.float32),
-        intensity=(sums.sum_intensity / count).astype(np.float32),
-        class_=np.where(ground, PointClass.GROUND, PointClass.STATIC).astype(np.uint8),
-        count=sums.count,
-        offset_m=(x * sums.tile_size_m, y * sums.tile_size_m, 0.0),
-        frame=sums.frame,
-        georeference=sums.georeference,
-        voxel_size_m=sums.voxel_size_m,
-        tile_size_m=sums.tile_size_m,
-        sessions=sessions,
-    )
+    return {
+        "x_m": (sums.sum_x_m / count).astype(np.float32),
+        "y_m": (sums.sum_y_m / count).astype(np.float32),
+        "z_m": (sums.sum_z_m / count).astype(np.float32),
+        "intensity": (sums.sum_intensity / count).astype(np.float32),
+        "count": sums.count,
+        "offset_m": (x * sums.tile_size_m, y * sums.tile_size_m, 0.0),
+        "frame": sums.frame,
+        "georeference": sums.georeference,
+        "voxel_size_m": sums.voxel_size_m,
+        "tile_size_m": sums.tile_size_m,
+        "sessions": sessions,
+    }
 
 
 def tile_ply(tile: Tile) -> bytes:

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from scanloom.schemas.clean import FinalLabels
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.product import Part, Parts
-from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
+from scanloom.schemas.scans import Deskewed, DeskewedScan, PointClass, ScanLabels
 from scanloom.schemas.session import Session
 from scanloom.schemas.tiles import Piece, Tile, TileFiles
 from scanloom.schemas.trajectory import Odometry, Poses, Truth
@@ -146,7 +147,7 @@ def one(product: Any, session: str = "a") -> Parts[Any]:
 def pieces_of(
     scans: Sequence[DeskewedScan], T: F8, settings: TilingSettings | None = None, poses: Poses | None = None
 ) -> list[Part[Piece]]:
-    labels = Labels(labels_of(scans, T))
+    labels = FinalLabels(labels_of(scans, T))
     return list(tiling(settings or TilingSettings(), Deskewed(scans), labels, poses or poses_of(T)))
 
 
@@ -168,7 +169,8 @@ def tiles_of(
         for part in source.pieces:
             where = (("session", source.session), ("chunk", source.chunk), ("tile", part.key))
             found.setdefault(part.key, []).append((where, part.product))
-    return {name: tiles(settings or TilesSettings(), Parts(parts)) for name, parts in sorted(found.items())}
+    made = {name: tiles(settings or TilesSettings(), Parts(parts)) for name, parts in sorted(found.items())}
+    return {name: (tile, files) for name, (tile, _, files) in made.items()}
 
 
 def tile_parts(made: dict[str, tuple[Tile, TileFiles]]) -> Parts[Tile]:

@@ -9,8 +9,9 @@ import pytest
 
 from scanloom.schemas.base import Base
 from scanloom.schemas.changes import ChangeFiles, Changes
+from scanloom.schemas.clean import FinalLabels
 from scanloom.schemas.product import Part, Parts
-from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
+from scanloom.schemas.scans import Deskewed, DeskewedScan, PointClass, ScanLabels
 from scanloom.schemas.tiles import Piece
 from scanloom.schemas.trajectory import Poses
 from scanloom.stages.changes.objects import objects_of
@@ -51,7 +52,9 @@ class Day:
         return ScanLabels(kind, scan.reference_ns, scan.scan_index)
 
     def pieces(self) -> Iterator[Part[Piece]]:
-        return tiling(TilingSettings(tile_size_m=20.0), Deskewed(self.scans), Labels(self.labels), self.poses)
+        return tiling(
+            TilingSettings(tile_size_m=20.0), Deskewed(self.scans), FinalLabels(self.labels), self.poses
+        )
 
 
 def day(where: BoxWorld, seed: int, count: int = 32) -> Day:
@@ -80,7 +83,7 @@ def found(
         by_session({"old": Base.of(old.poses) if base else blank, "new": blank}),
         by_session({name: d.poses for name, d in days.items()}),
         by_chunk({name: Deskewed(d.scans) for name, d in days.items()}),
-        by_chunk({name: Labels(d.labels) for name, d in days.items()}),
+        by_chunk({name: FinalLabels(d.labels) for name, d in days.items()}),
         Parts(pieces),
     )
 

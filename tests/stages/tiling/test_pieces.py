@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from scanloom.schemas.clean import FinalLabels
 from scanloom.schemas.errors import StageError
-from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
-from scanloom.schemas.tiles import Piece
+from scanloom.schemas.scans import Deskewed, DeskewedScan, PointClass, ScanLabels
+from scanloom.schemas.tiles import LEFT_OUT, RANK_SHIFT, Piece
 from scanloom.stages.geometry.se3 import F8, pose, so3_exp, transform
 from scanloom.stages.tiling import tiling
 from scanloom.stages.tiling.pieces import Settings
@@ -38,7 +39,10 @@ def place(
     """Pieces of one scan at the origin."""
     scan = cloud(points)
     made = tiling(
-        settings or Settings(), Deskewed([scan]), Labels([label(scan, classes)]), poses_of(np.eye(4)[None])
+        settings or Settings(),
+        Deskewed([scan]),
+        FinalLabels([label(scan, classes)]),
+        poses_of(np.eye(4)[None]),
     )
     return {part.key: part.product for part in made}
 
@@ -96,35 +100,53 @@ def test_pieces_come_ordered_and_repeat_bit_for_bit() -> None:
         assert len(set(voxels)) == len(voxels)
 
 
-def test_classes_that_are_not_kept_leave_no_trace() -> None:
-    points = np.array([[1.0, 1, 0], [2, 1, 0], [3, 1, 0], [4, 1, 0]])
-    classes = [PointClass.GROUND, PointClass.DYNAMIC, PointClass.STATIC, PointClass.EGO]
+def test_what_is_left_out_has_rows_of_its_own() -> None:
+    points = np.array([[1.0, 1, 0], [2, 1, 0], [3, 1, 0], [4, 1, 0], [2, 1, 0.01]])
+    classes = [PointClass.GROUND, PointClass.DYNAMIC, PointClass.STATIC, PointClass.EGO, PointClass.CHANGED]
     piece = place(points, classes=classes)["0_0"]
-    assert piece.count.sum() == 2
-    assert piece.ground_count.sum() == 1
+    rank = piece.voxel >> RANK_SHIFT
+    assert rank.tolist() == [
+        0,
+        0,
+        1 + LEFT_OUT.index(PointClass.DYNAMIC),
+        1 + LEFT_OUT.index(PointClass.CHANGED),
+    ]
+    assert (np.diff(piece.voxel) > 0).all()
+    assert piece.ground_count.tolist() == [1, 0, 0, 0]
+    assert len(set(piece.voxel[2:] & ((1 << RANK_SHIFT) - 1))) == 1
+
+
+def test_a_class_that_enters_the_map_is_not_left_out() -> None:
+    settings = Settings(classes=(PointClass.STATIC, PointClass.DYNAMIC))
+    piece = place(np.array([[1.0, 1, 0], [2, 1, 0]]), settings, [PointClass.STATIC, PointClass.DYNAMIC])[
+        "0_0"
+    ]
+    assert (piece.voxel >> RANK_SHIFT).tolist() == [0, 0]
 
 
 def test_scan_count_counts_scans_not_points() -> None:
     points = np.array([[1.01, 1.01, 0.01], [1.02, 1.02, 0.02]])
     scans = [cloud(points, 0), cloud(points, 1), cloud(points[:1], 2)]
     T = np.tile(np.eye(4), (3, 1, 1))
-    (part,) = tiling(Settings(), Deskewed(scans), Labels([label(s) for s in scans]), poses_of(T))
+    (part,) = tiling(Settings(), Deskewed(scans), FinalLabels([label(s) for s in scans]), poses_of(T))
     assert (part.product.count[0], part.product.scan_count[0]) == (5, 3)
 
 
 def test_points_that_are_not_finite_and_scans_without_pose_are_skipped() -> None:
     scans = [cloud(np.array([[1.0, 1, 0], [np.nan, 0, 0], [np.inf, 0, 0]]), 0), cloud(np.ones((4, 3)), 7)]
-    made = tiling(Settings(), Deskewed(scans), Labels([label(s) for s in scans]), poses_of(np.eye(4)[None]))
+    made = tiling(
+        Settings(), Deskewed(scans), FinalLabels([label(s) for s in scans]), poses_of(np.eye(4)[None])
+    )
     assert sum(int(part.product.count.sum()) for part in made) == 1
 
 
 def test_no_pose_at_all_and_foreign_labels_are_errors() -> None:
     scan = cloud(np.ones((4, 3)), 3)
     with pytest.raises(StageError, match="no scan of this chunk has a pose"):
-        list(tiling(Settings(), Deskewed([scan]), Labels([label(scan)]), poses_of(np.eye(4)[None])))
+        list(tiling(Settings(), Deskewed([scan]), FinalLabels([label(scan)]), poses_of(np.eye(4)[None])))
     other = ScanLabels(class_=np.zeros(3, np.uint8), reference_ns=0, scan_index=3)
     with pytest.raises(StageError, match="do not belong"):
-        list(tiling(Settings(), Deskewed([scan]), Labels([other]), poses_of(np.eye(4)[None])))
+        list(tiling(Settings(), Deskewed([scan]), FinalLabels([other]), poses_of(np.eye(4)[None])))
 
 
 def test_diverged_poses_are_named() -> None:
@@ -133,7 +155,7 @@ def test_diverged_poses_are_named() -> None:
 
 
 def test_an_empty_chunk_gives_no_pieces() -> None:
-    assert list(tiling(Settings(), Deskewed([]), Labels([]), poses_of(np.eye(4)[None]))) == []
+    assert list(tiling(Settings(), Deskewed([]), FinalLabels([]), poses_of(np.eye(4)[None]))) == []
     assert place(np.empty((0, 3))) == {}
 
 
