@@ -64,9 +64,26 @@ def _options(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--systems", nargs="+", choices=tuple(SYSTEMS), default=tuple(SYSTEMS))
     parser.add_argument("--store", type=Path, default=WORK / "store", help="store of the scenes' products")
     parser.add_argument("--fresh", action="store_true", help="run every system again, for times of one run")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="STAGE.NAME=VALUE",
+        help="a setting of rays, clean or relabel",
+    )
     parser.add_argument("--quick", action="store_true", help="accuracy and time alone")
     parser.add_argument("--json", default="", help="file for the figures, or - for standard output")
     return parser.parse_args(words)
+
+
+def _settings(words: Sequence[str]) -> dict[str, dict[str, float]]:
+    """`STAGE.NAME=VALUE` as settings by stage."""
+    chosen: dict[str, dict[str, float]] = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        stage, _, field = name.partition(".")
+        chosen.setdefault(stage, {})[field] = json.loads(value)
+    return chosen
 
 
 def _there(system: System) -> bool:
@@ -89,7 +106,7 @@ def _of_scene(
     everything = np.ones(len(placed), np.bool_)
     before = None if options.quick else localisation(found, poses, everything)
     for system in systems:
-        outcome, held = _best(system, found, poses, placed, options.fresh)
+        outcome, held = _best(system, found, poses, placed, options)
         scores = [*_accuracy_scores(found, held), *_time(outcome)]
         if before is not None and system.name != "none":
             scores += entropy_scores(placed, outcome.kept, may_stand(found.true_class))
@@ -102,12 +119,14 @@ def _of_scene(
             )
 
 
-def _best(system: System, found: Scene, poses: str, placed: F4, fresh: bool) -> tuple[Outcome, Mask]:
+def _best(
+    system: System, found: Scene, poses: str, placed: F4, options: argparse.Namespace
+) -> tuple[Outcome, Mask]:
     """The variant with the highest associated accuracy, and which points of the ground truth its output holds."""
     static, dynamic = is_static(found.true_class), is_dynamic(found.true_class)
     tried = []
     for variant in system.variants:
-        outcome = classify(system, variant, found, poses, fresh)
+        outcome = classify(system, variant, found, poses, _settings(options.set), options.fresh)
         held = kept_in_map(placed, outcome.kept, static | dynamic)
         tried.append((accuracy(static, dynamic, held).merit, outcome, held))
     _, outcome, held = max(tried, key=lambda each: each[0])

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from benchmarks.clean_boxes import LABELS, BoxTrack, boxed, read_boxes
 from benchmarks.clean_scores import UNJUDGED
-from benchmarks.sequences import Drive, produced
+from benchmarks.sequences import NODE_OF, Drive, produced
 from scanloom.pipeline.run import Result
+from scanloom.schemas.product import Product
 from scanloom.schemas.scans import (
     Deskewed,
     DeskewedScan,
@@ -30,14 +31,14 @@ from scanloom.schemas.scans import (
     TrueLabels,
     TruePoints,
 )
-from scanloom.schemas.session import Session, TruthLog
-from scanloom.schemas.simulated import TrueObjects
-from scanloom.schemas.tracks import Imu, Wheel
-from scanloom.schemas.trajectory import Odometry, Poses, Truth
+from scanloom.schemas.session import TruthLog
+from scanloom.schemas.simulated import TrueObjects, TrueTracks
+from scanloom.schemas.trajectory import Poses, Truth
 from scanloom.stages.geometry.interpolation import interpolate_poses
 from scanloom.stages.geometry.se3 import F8
 
-MADE = (Truth, Deskewed, Labels, Session, Imu, Wheel, Odometry, Poses)
+CLEANING = ("rays", "clean", "relabel")
+"""Our stages that are run here; what they read apart from each other's products is made by the workflow."""
 LEFT_OUT = (PointClass.EGO, PointClass.OUT_OF_RANGE)
 REAL = Path("../shared/data/kitti_raw_0005")
 TRUE, ESTIMATED = "truth", "estimated"
@@ -88,6 +89,8 @@ class Scene:
     """What the objects are, by number."""
     files: Mapping[str, Sequence[str]]
     """Where the products lie, by name."""
+    inputs: Mapping[str, str]
+    """Digest of points and poses by set of poses."""
     objects: bool
 
     def __len__(self) -> int:
@@ -107,6 +110,18 @@ class Scene:
         return out
 
 
+def of_session() -> tuple[type[Product], ...]:
+    """What the stages of cleaning read of a whole session."""
+    read = dict.fromkeys(product for stage in CLEANING for product in NODE_OF[stage].reads)
+    between = {product for stage in CLEANING for product in NODE_OF[stage].writes}
+    return tuple(p for p in read if p not in between and p not in (Deskewed, Labels))
+
+
+def made() -> tuple[type[Product], ...]:
+    """What the workflow makes for a scene."""
+    return (Truth, Deskewed, Labels, *of_session())
+
+
 def scene(place: Place, store: Path, kept: Path) -> Scene:
     """Run what is missing of the workflow and gather the points, unless that was done before.
 
@@ -114,7 +129,7 @@ def scene(place: Place, store: Path, kept: Path) -> Scene:
     ------
     ScanloomError : a stage failed.
     """
-    result = produced(place.drive, MADE, store)
+    result = produced(place.drive, made(), store)
     folder = kept / f"{place.drive.name}-{_digest(result)}"
     if not (folder / "scene.json").exists():
         shutil.rmtree(folder, ignore_errors=True)
@@ -124,7 +139,7 @@ def scene(place: Place, store: Path, kept: Path) -> Scene:
 
 
 def _digest(result: Result) -> str:
-    read = (*MADE, TruthLog)
+    read = (*made(), TruthLog)
     digests = sorted(
         part.digest for _, artifact in result.artifacts for product in read for part in artifact.of(product)
     )
@@ -145,9 +160,22 @@ def _gather(place: Place, result: Result, folder: Path) -> None:
         kinds = _simulated(result, folder)
     else:
         kinds = _measured(place, result, folder, T)
-    files = {p.NAME: [str(path) for _, path in result.files(p)] for p in (*MADE, TruthLog)}
-    described = {"kinds": kinds, "files": files}
+    files = {p.NAME: [str(path) for _, path in result.files(p)] for p in (*made(), TruthLog)}
+    described = {"kinds": kinds, "files": files, "inputs": _inputs(place, folder)}
     (folder / "scene.json").write_text(json.dumps(described, indent=1) + "\n")
+
+
+def _inputs(place: Place, folder: Path) -> dict[str, str]:
+    """Digest of points and poses by set of poses: what a system that knows nothing else depends on."""
+    common = hashlib.sha256()
+    for name in ("points", "starts"):
+        common.update(np.load(folder / f"{name}.npy").data)
+    digests = {}
+    for poses in place.poses:
+        digest = common.copy()
+        digest.update(np.load(folder / f"T_{poses}.npy").data)
+        digests[poses] = digest.hexdigest()[:16]
+    return digests
 
 
 def _near_origin(T: F8) -> F8:
@@ -165,11 +193,14 @@ def _simulated(result: Result, folder: Path) -> dict[int, str]:
         folder,
         ((scan, labels, _same(scan, next(true))) for scan, labels in scans_of(result)),
     )
-    objects = log / "objects.parquet"
-    if not objects.exists():
-        return {}
-    listed = TrueObjects.open(objects)
-    return {int(n): str(what) for n, what in zip(listed.instance, listed.what)}
+    return {**_named(log / "objects.parquet", TrueObjects), **_named(log / "tracks.parquet", TrueTracks)}
+
+
+def _named(path: Path, table: type[TrueObjects] | type[TrueTracks]) -> dict[int, str]:
+    """What the objects of a table are; those that move are called so."""
+    listed = table.open(path)
+    moving = "moving " if table is TrueTracks else ""
+    return {int(n): f"{moving}{what}" for n, what in zip(listed.instance, listed.what)}
 
 
 def _same(scan: DeskewedScan, true: TrueLabels) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
@@ -233,5 +264,6 @@ def _opened(place: Place, folder: Path) -> Scene:
         poses={name: array(f"T_{name}") for name in place.poses},
         kinds={int(number): what for number, what in described["kinds"].items()},
         files=described["files"],
+        inputs=described["inputs"],
         objects=place.objects,
     )

@@ -19,8 +19,8 @@ from scanloom.schemas.scans import PointClass
 
 REACH_M = 0.05
 RANGES_M = (0.0, 20.0, 40.0, 100.0)
-STATIC = (PointClass.UNLABELLED, PointClass.GROUND, PointClass.STATIC)
-DYNAMIC = (PointClass.DYNAMIC,)
+STANDING = (PointClass.UNLABELLED, PointClass.GROUND, PointClass.STATIC)
+"""Classes of what stays in a map, and of what truly stands."""
 UNJUDGED = PointClass.OUT_OF_RANGE
 """True class where nobody knows it: such a point is in neither set."""
 
@@ -64,17 +64,17 @@ def _percent(part: int, whole: int) -> float:
 
 def is_static(true_class: NDArray[np.uint8]) -> Mask:
     """Points of the ground truth that stand; own vehicle, particles and stray returns are in neither set."""
-    return np.isin(true_class, STATIC)
+    return np.isin(true_class, STANDING)
 
 
 def is_dynamic(true_class: NDArray[np.uint8]) -> Mask:
     """Points of the ground truth that move."""
-    return np.isin(true_class, DYNAMIC)
+    return true_class == PointClass.DYNAMIC
 
 
 def may_stand(true_class: NDArray[np.uint8]) -> Mask:
     """Points that stand, and those that nobody knows of."""
-    return np.isin(true_class, (*STATIC, UNJUDGED))
+    return np.isin(true_class, (*STANDING, UNJUDGED))
 
 
 def kept_in_map(points: F4, kept: Mask, judged: Mask, reach_m: float = REACH_M) -> Mask:

@@ -8,6 +8,7 @@ run the better one stands for it.
 from __future__ import annotations
 
 import hashlib
+import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,11 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.clean_nearness import Mask
+from benchmarks.clean_ours import PROCESSES, Settings, cleaned
 from benchmarks.clean_scenes import Scene
+from benchmarks.clean_scores import STANDING
 from scanloom import stages
-from scanloom.schemas.scans import PointClass
 
-STANDING = (PointClass.UNLABELLED, PointClass.GROUND, PointClass.STATIC)
 THREADS = 2
 RESOLUTION_M, INFLATED_HITS_M = 0.1, 0.2
 OURS, PEER = "scanloom", "dufomap"
@@ -45,16 +46,22 @@ class System:
     name: str
     variants: tuple[str, ...]
     """The best by associated accuracy stands for the system."""
-    run: Callable[[Scene, str, str], Outcome]
+    run: Callable[[Scene, str, str, Settings], Outcome]
     version: Callable[[], str]
     """Empty where the system is not installed; outcomes are kept under it."""
+    ours: bool = False
+    """Reads more than points and poses, and has settings."""
 
 
-def classify(system: System, variant: str, scene: Scene, poses: str, fresh: bool) -> Outcome:
+def classify(
+    system: System, variant: str, scene: Scene, poses: str, settings: Settings, fresh: bool
+) -> Outcome:
     """Run a system, unless the same version has said before what it keeps of the scene; `fresh` runs it again."""
-    path = scene.folder / f"{system.name}-{variant}-{poses}-{system.version()}.npz"
+    read = f"{scene.folder.name}-{poses}-{_short(settings)}" if system.ours else scene.inputs[poses]
+    path = scene.folder.parent / "outcomes" / f"{system.name}-{variant}-{read}-{system.version()}.npz"
+    path.parent.mkdir(exist_ok=True)
     if fresh or not path.exists():
-        found = system.run(scene, poses, variant)
+        found = system.run(scene, poses, variant, settings)
         bits = np.packbits(found.kept)
         np.savez(path, kept=bits, ms_per_scan=found.ms_per_scan, how=found.how)
     with np.load(path) as file:
@@ -62,15 +69,19 @@ def classify(system: System, variant: str, scene: Scene, poses: str, fresh: bool
         return Outcome(kept, float(file["ms_per_scan"]), str(file["how"]))
 
 
-def _everything(scene: Scene, poses: str, variant: str) -> Outcome:
+def _short(settings: Settings) -> str:
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
+
+
+def _everything(scene: Scene, poses: str, variant: str, settings: Settings) -> Outcome:
     return Outcome(np.ones(len(scene.points), np.bool_), float("nan"), "every point stays")
 
 
-def _denoised(scene: Scene, poses: str, variant: str) -> Outcome:
+def _denoised(scene: Scene, poses: str, variant: str, settings: Settings) -> Outcome:
     return Outcome(np.isin(scene.labels, STANDING), float("nan"), "labels of denoise alone")
 
 
-def _dufomap(scene: Scene, poses: str, variant: str) -> Outcome:
+def _dufomap(scene: Scene, poses: str, variant: str, settings: Settings) -> Outcome:
     """Integration, propagation and the segmentation of every scan; reading is no part of the time."""
     from dufomap import dufomap
 
@@ -85,6 +96,14 @@ def _dufomap(scene: Scene, poses: str, variant: str) -> Outcome:
     moving = [system.segment(points, pose, cloud_transform=True) for points, pose in zip(scans, T)]
     ms = 1e3 * (time.perf_counter() - started) / len(scene)
     return Outcome(np.concatenate(moving) == 0, ms, f"d_p {inflated}, {THREADS} threads")
+
+
+def _ours(scene: Scene, poses: str, variant: str, settings: Settings) -> Outcome:
+    classes, ms = cleaned(scene, poses, settings)
+    changed = "".join(f", {stage}.{k}={v}" for stage, own in settings.items() for k, v in own.items())
+    return Outcome(
+        np.isin(classes, STANDING), ms, f"rays, clean and relabel on {PROCESSES} processes{changed}"
+    )
 
 
 def _version_of_peer() -> str:
@@ -103,7 +122,8 @@ SYSTEMS = {
     system.name: system
     for system in (
         System("none", ("all",), _everything, lambda: "1"),
-        System("denoise", ("labels",), _denoised, lambda: "1"),
+        System("denoise", ("labels",), _denoised, lambda: "1", ours=True),
+        System(OURS, ("labels",), _ours, _version_of_ours, ours=True),
         System(PEER, ("d_p_1", "d_p_2"), _dufomap, _version_of_peer),
     )
 }
