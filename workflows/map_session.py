@@ -58,7 +58,7 @@ NODES: tuple[Node, ...] = (
     node("fusion",     fusion,     per="map",     reads=(Session, Odometry, Loops, Gnss, Imu, Wheel, SensorCheck, Base), writes=(Poses, Graph)),
     node("rays",       rays,       per="chunk",   reads=(Deskewed, Labels, Poses),             writes=Rays),
     node("clean",      clean,      per="tile",    reads=(Rays,),                               writes=Cleared),
-    node("relabel",    relabel,    per="chunk",   reads=(Deskewed, Labels, Cleared, Poses),    writes=(FinalLabels, ClassCounts)),
+    node("relabel",    relabel,    per="chunk",   reads=(Deskewed, Labels, ObjectTracks, Cleared, Poses), writes=(FinalLabels, ClassCounts)),
     node("tiling",     tiling,     per="chunk",   reads=(Deskewed, FinalLabels, Poses),        writes=Piece),
     node("changes",    changes,    per="map",     reads=(Base, Poses, Deskewed, FinalLabels, Piece), writes=(Changes, ChangeFiles)),
     node("tiles",      tiles,      per="tile",    reads=(Piece,),                              writes=(Tile, RemovedTile, TileFiles)),

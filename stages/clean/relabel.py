@@ -2,7 +2,8 @@
 
 A point's voxel says whether what the session met there moved or has changed. Of a thing that hangs together in a scan, most
 of which moved, all moved: its wheels, which rays to the ground hardly pass, and its roof before the sky, which none passes.
-Classes that denoise gave for reasons of its own (ground, own vehicle, dust, strays) stay.
+What the tracker saw drive about moved as well, wherever its box is; free space alone cannot know of a car that stood where nobody
+looked again. Classes that denoise gave for reasons of its own (ground, own vehicle, dust, strays) stay.
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from scanloom.schemas.clean import ClassCounts, Cleared, FinalLabels, Standing
+from scanloom.schemas.objects import ObjectTracks
 from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
 from scanloom.schemas.trajectory import Poses
 from scanloom.stages.clean import incidence
 from scanloom.stages.clean.clusters import clusters
 from scanloom.stages.clean.lookup import Verdicts
+from scanloom.stages.geometry.boxes import inside_boxes
 from scanloom.stages.geometry.se3 import F8
 
 VERSION = 1
@@ -47,17 +50,30 @@ class Settings(BaseModel):
     least_points: int = Field(
         5, ge=1, le=1000, description="points that hang together are a thing from this number on"
     )
+    box_margin_m: float = Field(
+        0.1, ge=0.0, le=2.0, description="points this close to the box of a moving object moved, m"
+    )
+    wide_box_margin_m: float = Field(
+        0.3, ge=0.0, le=2.0, description="so did points this close to it whose place does not stand, m"
+    )
 
 
 def relabel(
-    settings: Settings, deskewed: Deskewed, labels: Labels, cleared: Parts[Cleared], poses: Poses
+    settings: Settings,
+    deskewed: Deskewed,
+    labels: Labels,
+    tracks: ObjectTracks,
+    cleared: Parts[Cleared],
+    poses: Poses,
 ) -> Iterator[FinalLabels | ClassCounts]:
     """A class for every point of every scan of a chunk, scan by scan, in the order of the points; then their numbers.
 
     Scans without a pose keep the classes they have.
     """
     counts: list[tuple[int, I8, I8]] = []
-    yield FinalLabels(_relabelled(settings, deskewed, labels, cleared, poses, counts))
+    yield FinalLabels(
+        _counting(_relabelled(settings, deskewed, labels, _Map(tracks, cleared, poses)), counts)
+    )
     index, before, after = zip(*counts) if counts else ((), (), ())
     shape = (len(counts), len(PointClass))
     yield ClassCounts(
@@ -67,40 +83,68 @@ def relabel(
     )
 
 
+class _Map:
+    """What the whole map says of a scan."""
+
+    def __init__(self, tracks: ObjectTracks, cleared: Parts[Cleared], poses: Poses) -> None:
+        self.verdicts, self.image = Verdicts(cleared), incidence.new_image()
+        self._T = {int(i): T for i, T in zip(poses.scan_index, poses.T_world_lidar) if np.isfinite(T).all()}
+        self._tracks = tracks.take(tracks.dynamic)
+
+    def pose(self, scan: DeskewedScan) -> F8 | None:
+        return self._T.get(scan.scan_index)
+
+    def boxes(self, scan: DeskewedScan) -> F8:
+        """Boxes (m, 15) of what moves in the scan."""
+        first, last = np.searchsorted(self._tracks.scan_index, [scan.scan_index, scan.scan_index + 1])
+        return self._tracks.take(slice(first, last)).boxes()
+
+
 def _relabelled(
-    settings: Settings, deskewed: Deskewed, labels: Labels, cleared: Parts[Cleared], poses: Poses,
-    counts: list[tuple[int, I8, I8]],
-) -> Iterator[ScanLabels]:  # fmt: skip
-    T_of = {int(i): T for i, T in zip(poses.scan_index, poses.T_world_lidar) if np.isfinite(T).all()}
-    verdicts, image = Verdicts(cleared), incidence.new_image()
+    settings: Settings, deskewed: Deskewed, labels: Labels, known: _Map
+) -> Iterator[tuple[ScanLabels, ScanLabels]]:
     for scan, label in zip(deskewed, labels, strict=True):
-        T = T_of.get(scan.scan_index)
-        classes = label.class_ if T is None else final(settings, scan, label.class_, verdicts, T, image)
-        counts.append((scan.scan_index, _counted(label.class_), _counted(classes)))
-        yield ScanLabels(class_=classes, reference_ns=label.reference_ns, scan_index=label.scan_index)
+        classes = final(settings, scan, label.class_, known)
+        yield label, ScanLabels(class_=classes, reference_ns=label.reference_ns, scan_index=label.scan_index)
+
+
+def _counting(
+    pairs: Iterator[tuple[ScanLabels, ScanLabels]], counts: list[tuple[int, I8, I8]]
+) -> Iterator[ScanLabels]:
+    for before, after in pairs:
+        counts.append((after.scan_index, _counted(before.class_), _counted(after.class_)))
+        yield after
 
 
 def _counted(classes: U1) -> I8:
     return np.bincount(classes, minlength=len(PointClass))[: len(PointClass)]
 
 
-def final(
-    settings: Settings,
-    scan: DeskewedScan,
-    classes: U1,
-    verdicts: Verdicts,
-    T_world_lidar: F8,
-    image: NDArray[np.int32],
-) -> U1:
+def final(settings: Settings, scan: DeskewedScan, classes: U1, known: _Map) -> U1:
     """Final classes (n,) of the points of one scan."""
+    T_world_lidar = known.pose(scan)
+    if T_world_lidar is None:
+        return classes
     judged = np.isin(classes, JUDGED)
-    said = verdicts.of(scan, judged, T_world_lidar)
-    thing = _things(settings, scan, judged & (said != Standing.STANDS), image)
+    said = known.verdicts.of(scan, judged, T_world_lidar)
+    boxed = judged & _boxed(settings, scan, known.boxes(scan), said)
+    said[boxed] = Standing.MOVED
+    thing = _things(settings, scan, judged & (said != Standing.STANDS), known.image)
     out = classes.copy()
     for standing_, class_ in ((Standing.CHANGED, PointClass.CHANGED), (Standing.MOVED, PointClass.DYNAMIC)):
         told = said == standing_
         out[told | (judged & _with_the_rest(settings, thing, told))] = class_
     return out
+
+
+def _boxed(settings: Settings, scan: DeskewedScan, boxes: F8, said: U1) -> B1:
+    """Points (n,) of what the tracker saw move."""
+    if not len(boxes):
+        return np.zeros(len(scan), np.bool_)
+    xyz = (scan.x_m, scan.y_m, scan.z_m)
+    near = inside_boxes(*xyz, boxes, settings.box_margin_m) >= 0
+    around = inside_boxes(*xyz, boxes, settings.wide_box_margin_m) >= 0
+    return np.asarray(near | (around & (said != Standing.STANDS)))
 
 
 def _things(
