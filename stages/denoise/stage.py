@@ -16,6 +16,7 @@ from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
+from scanloom.stages.denoise.airborne import airborne
 from scanloom.stages.denoise.bounds import bounded
 from scanloom.stages.denoise.settings import Settings
 from scanloom.stages.denoise.window import Moment, View, moments
@@ -56,7 +57,9 @@ def denoise(
 
 def _labelled(settings: Settings, around: Iterator[Moment]) -> Iterator[ScanLabels]:
     for moment in around:
-        scan, classes = moment.view.scan, moment.view.classes
+        scan, classes = moment.view.scan, moment.view.classes.copy()
+        if settings.particles:
+            classes[airborne(moment)] = PointClass.AIRBORNE
         yield ScanLabels(class_=classes, reference_ns=scan.reference_ns, scan_index=scan.scan_index)
 
 

@@ -75,7 +75,9 @@ class RangeImage:
     column_rad: float
     """Azimuth between columns."""
     row_of_bin: I4
-    """(BINS,) row of each bin of elevation, for `cell_of`."""
+    """(BINS,) row of each bin of elevation (`elevation_bin`)."""
+    cell: I4
+    """(n,) row * columns + column of each point, -1 for those that are not drawn."""
 
 
 def range_image(settings: ImageSettings, x_m: F4, y_m: F4, z_m: F4, seen: B1, drawn: B1) -> RangeImage:
@@ -92,8 +94,8 @@ def range_image(settings: ImageSettings, x_m: F4, y_m: F4, z_m: F4, seen: B1, dr
     columns = int(np.clip(FILLED_SHARE * points.max(), LEAST_COLUMNS, settings.columns))
     row = np.repeat(np.arange(len(first), dtype=np.int32), np.diff(ends))
     point, ranges = np.full((len(first), columns), -1, np.int32), np.zeros((len(first), columns), np.float32)
-    _draw(x_m, y_m, z_m, drawn, elevation, row, point, ranges)
-    return RangeImage(point, ranges, middle, TAU / columns, row)
+    cell = _draw(x_m, y_m, z_m, drawn, elevation, row, point, ranges)
+    return RangeImage(point, ranges, middle, TAU / columns, row, cell)
 
 
 def _first_bins(settings: ImageSettings, counts: I8, still: I8) -> I8:
@@ -168,16 +170,19 @@ def _beams(counts: I8) -> tuple[I8, I8]:
 
 
 @kernel
-def _draw(x: F4, y: F4, z: F4, drawn: B1, elevation: I2, row: I4, point: I4, ranges: F4) -> None:
+def _draw(x: F4, y: F4, z: F4, drawn: B1, elevation: I2, row: I4, point: I4, ranges: F4) -> I4:
     columns = point.shape[1]
+    cell = np.full(len(x), -1, np.int32)
     for n in range(len(x)):
         if not drawn[n] or elevation[n] < 0:
             continue
         v = row[elevation[n]]
         u = min(int(turn_of(x[n], y[n]) * np.float32(columns)), columns - 1)
         r = np.sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n])
+        cell[n] = v * columns + u
         if point[v, u] < 0 or r < ranges[v, u]:
             point[v, u], ranges[v, u] = n, r
+    return cell
 
 
 @kernel

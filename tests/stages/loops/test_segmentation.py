@@ -27,7 +27,7 @@ def image_of(ranges: F4, elevation_deg: F4 | None = None) -> tuple[RangeImage, F
     up = np.broadcast_to(elevation[:, None], ranges.shape)
     direction = np.stack((np.cos(up) * np.cos(azimuth), np.cos(up) * np.sin(azimuth), np.sin(up)), axis=-1)
     xyz = (direction * ranges[..., None])[filled].astype(np.float32)
-    return RangeImage(point, ranges.astype(np.float32), elevation, 2 * np.pi / columns, NO_ROWS), xyz
+    return RangeImage(point, ranges.astype(np.float32), elevation, 2 * np.pi / columns, NO_ROWS, NO_ROWS), xyz
 
 
 def labels_of_ranges(ranges: F4, intensity: float | F4 = np.nan, **settings: object) -> F4:
