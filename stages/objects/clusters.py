@@ -12,8 +12,10 @@ F4 = NDArray[np.float32]
 I4 = NDArray[np.int32]
 
 FREE = -1
-FAR_M = (20.0, 40.0)
-"""Beyond these, cells one and two apart still touch."""
+ALONG_SHARE, ACROSS_SHARE = 0.045, 0.012
+"""Points touch that are so far apart per metre of range, along a ray and across it: rays that graze the side of a car are
+far apart along it."""
+LONGEST_M = 1.2
 
 
 @kernel
@@ -48,11 +50,18 @@ def _flood(grid: I4, stack: I4, a: int, b: int, number: int, edge: float) -> Non
     while top > 0:
         top -= 1
         i, j = stack[top, 0], stack[top, 1]
-        r = np.hypot(i - side // 2, j - side // 2) * edge
-        reach = 1 + int(r > FAR_M[0]) + int(r > FAR_M[1])
+        x, y = (i - side // 2) * edge, (j - side // 2) * edge
+        r = max(np.hypot(x, y), edge)
+        along = max(min(ALONG_SHARE * r, LONGEST_M) / edge, 1.5)
+        across = max(min(ACROSS_SHARE * r, LONGEST_M) / edge, 1.5)
+        reach = int(along)
         for u in range(max(i - reach, 0), min(i + reach + 1, side)):
             for v in range(max(j - reach, 0), min(j + reach + 1, side)):
-                if grid[u, v] == -2:
+                if grid[u, v] != -2:
+                    continue
+                radial = abs((u - i) * x + (v - j) * y) / r
+                lateral = abs((v - j) * x - (u - i) * y) / r
+                if (radial / along) ** 2 + (lateral / across) ** 2 <= 1.0:
                     grid[u, v] = number
                     stack[top, 0], stack[top, 1] = u, v
                     top += 1

@@ -26,9 +26,10 @@ LENGTH_KNOWN, WIDTH_KNOWN = 26, 27
 HITS, MISSED_S = 28, 29
 STATE = 30
 
-MEASURED_X, MEASURED_Y, R_XX, R_XY, R_YY, GROWS_U, GROWS_V, POINTS = 0, 1, 2, 3, 4, 5, 6, 7
-"""What an update saw: the middle of the box, its covariance, and where the box grows to: 1 forward, -1 back, 0 neither."""
-SEEN = 8
+MEASURED_X, MEASURED_Y, R_XX, R_XY, R_YY, GROWS_U, GROWS_V, POINTS, UPRIGHT = 0, 1, 2, 3, 4, 5, 6, 7, 8
+"""What an update saw: the middle of the box, its covariance, where the box grows to (1 forward, -1 back, 0 neither), how
+many points, and how far these reach upwards, m."""
+SEEN = 9
 
 ACCELERATION_M_S2 = 4.0
 YAW_RATE_VAR = 0.05
@@ -38,7 +39,11 @@ SMALL_M = 1.1
 USUAL = (4.3, 1.8)
 """Length and width of a car of which one end or one side is seen, m."""
 UNSEEN_M = 4.0
-MOVING_M_S = 2.0
+SHARP_M = 0.4
+"""Ends seen less sharply do not tell the size."""
+GATE = 25.0
+"""A measurement farther off, in squared standard deviations, is of something else."""
+MOVING_M_S, SURE_M_S = 2.0, 1.5
 
 
 @kernel
@@ -102,14 +107,15 @@ def _middle(low: float, high: float, size: float) -> tuple[float, float]:
 
 
 @kernel
-def _stand(points: F4, origin: F8, ground: F4, row: F8) -> None:
-    """Foot on the ground, height of the highest point."""
+def _stand(points: F4, origin: F8, ground: F4, row: F8) -> float:
+    """Foot on the ground, height of the highest point; returns how far the points reach upwards, m."""
     foot = origin[2] + ground_at(ground, row[X] - origin[0], row[Y] - origin[1])
-    top = -np.inf
+    top, low = -np.inf, np.inf
     for n in range(len(points)):
-        top = max(top, origin[2] + points[n, 2])
+        top, low = max(top, origin[2] + points[n, 2]), min(low, origin[2] + points[n, 2])
     row[FOOT] = foot if row[HITS] == 0.0 else row[FOOT] + 0.3 * (foot - row[FOOT])
     row[HEIGHT] = max(row[HEIGHT], top - row[FOOT])
+    return top - low
 
 
 @kernel
@@ -138,8 +144,10 @@ def update(
     seen[R_XY] = c * s * (variance[0] - variance[1])
     seen[R_YY] = s * s * variance[0] + c * c * variance[1]
     seen[GROWS_U], seen[GROWS_V], seen[POINTS] = grows[0], grows[1], len(points)
-    _correct(row, seen)
-    _stand(points, origin, ground, row)
+    if not _correct(row, seen):
+        seen[:] = 0.0
+        return
+    seen[UPRIGHT] = _stand(points, origin, ground, row)
     row[HITS] += 1.0
     row[MISSED_S] = 0.0
 
@@ -152,7 +160,7 @@ def _along(row: F8, axis: int, here: float, sides: F8, spread: F8) -> tuple[floa
     size, known = row[LENGTH + axis], row[LENGTH_KNOWN + axis]
     whole = np.isfinite(s_low) and np.isfinite(s_high)
     seen = high - low
-    if whole:
+    if whole and max(s_low, s_high) < SHARP_M:
         blend = 1.0 / min(known + 1.0, 10.0) if seen < size or known == 0.0 else 0.5
         new = size + blend * (seen - size)
         row[LENGTH_KNOWN + axis] = known + 1.0
@@ -181,7 +189,7 @@ def _along(row: F8, axis: int, here: float, sides: F8, spread: F8) -> tuple[floa
 def _turn(points: F4, row: F8) -> None:
     """Correct the yaw by the shape, and by the velocity once it is known."""
     speed = np.hypot(row[VX], row[VY])
-    if speed > MOVING_M_S and row[HITS] >= 4.0:
+    if speed > MOVING_M_S and row[HITS] >= 4.0 and row[P + 10] + row[P + 15] < SURE_M_S**2:
         heading = np.arctan2(row[VY], row[VX])
         off = heading - row[YAW]
         quarter = np.round(off / (0.5 * np.pi))
@@ -210,14 +218,87 @@ def _yaw(row: F8, off: float, variance: float) -> None:
 
 
 @kernel
-def _correct(row: F8, seen: F8) -> None:
-    """Kalman update of position and velocity by a measured position."""
+def _correct(row: F8, seen: F8) -> bool:
+    """Kalman update of position and velocity by a measured position; False where it is too far off to be the same thing."""
     C = row[P : P + 16].copy().reshape(4, 4)
     a, b, d = C[0, 0] + seen[R_XX], C[0, 1] + seen[R_XY], C[1, 1] + seen[R_YY]
     determinant = a * d - b * b
     inverse = np.array([[d, -b], [-b, a]]) / determinant
     gain = np.ascontiguousarray(C[:, :2]) @ inverse
     off = np.array([seen[MEASURED_X] - row[X], seen[MEASURED_Y] - row[Y]])
+    if off @ inverse @ off > GATE:
+        return False
     row[:4] += gain @ off
     C -= gain @ np.ascontiguousarray(C[:2, :])
     row[P : P + 16] = (0.5 * (C + C.T)).ravel()
+    return True
+
+
+MERGE_GAP_M = 0.7
+MERGE_M_S, MERGE_SURE_M_S = 1.2, 1.2
+MERGE_SLOW_M_S = 2.0
+MERGE_HITS = 4.0
+
+
+@kernel
+def same(a: F8, b: F8, longest: float, widest: float) -> bool:
+    """Whether two tracks are parts of one thing: side by side at one speed, and together no larger than things are."""
+    if a[HITS] < MERGE_HITS or b[HITS] < MERGE_HITS:
+        return False
+    if max(a[P + 10] + a[P + 15], b[P + 10] + b[P + 15]) > MERGE_SURE_M_S**2:
+        return False
+    if np.hypot(a[VX] - b[VX], a[VY] - b[VY]) > MERGE_M_S:
+        return False
+    small = max(a[LENGTH], a[WIDTH], b[LENGTH], b[WIDTH]) <= SMALL_M
+    if np.hypot(a[VX], a[VY]) < (1.0 if not small else 1.0 + MERGE_SLOW_M_S):
+        return False
+    if np.hypot(a[X] - b[X], a[Y] - b[Y]) > 0.5 * (longest + max(b[LENGTH], b[WIDTH])):
+        return False
+    own, other = _reach(a, a), _reach(b, a)
+    gap = max(max(own[0], other[0]) - min(own[1], other[1]), max(own[2], other[2]) - min(own[3], other[3]))
+    along = max(own[1], other[1]) - min(own[0], other[0])
+    across = max(own[3], other[3]) - min(own[2], other[2])
+    return bool(gap < MERGE_GAP_M and max(along, across) < longest and min(along, across) < widest)
+
+
+@kernel
+def _reach(row: F8, frame: F8) -> F8:
+    """Lowest and highest u and v (4,) of a box around the middle of another, along the axes of that."""
+    turn = row[YAW] - frame[YAW]
+    c, s = abs(np.cos(turn)), abs(np.sin(turn))
+    half_u = 0.5 * (c * row[LENGTH] + s * row[WIDTH])
+    half_v = 0.5 * (s * row[LENGTH] + c * row[WIDTH])
+    dx, dy = row[X] - frame[X], row[Y] - frame[Y]
+    u = np.cos(frame[YAW]) * dx + np.sin(frame[YAW]) * dy
+    v = np.cos(frame[YAW]) * dy - np.sin(frame[YAW]) * dx
+    return np.array([u - half_u, u + half_u, v - half_v, v + half_v])
+
+
+@kernel
+def join(a: F8, b: F8) -> None:
+    """Let the first track take in the box of the second."""
+    own, other = _reach(a, a), _reach(b, a)
+    sides = np.array([
+        min(own[0], other[0]), max(own[1], other[1]), min(own[2], other[2]), max(own[3], other[3])
+    ])  # fmt: skip
+    u, v = 0.5 * (sides[0] + sides[1]), 0.5 * (sides[2] + sides[3])
+    c, s = np.cos(a[YAW]), np.sin(a[YAW])
+    a[X] += c * u - s * v
+    a[Y] += s * u + c * v
+    a[LENGTH], a[WIDTH] = sides[1] - sides[0], sides[3] - sides[2]
+    a[LENGTH_KNOWN], a[WIDTH_KNOWN] = 1.0, 1.0
+    a[HEIGHT] = max(a[HEIGHT], b[HEIGHT])
+    a[P] += 0.3
+    a[P + 5] += 0.3
+
+
+@kernel
+def merged(state: F8, longest: float, widest: float) -> NDArray[np.bool_]:
+    """Join tracks that are parts of one thing into the older ones, in place; returns which remain (m,)."""
+    remain = np.ones(len(state), np.bool_)
+    for i in range(len(state)):
+        for k in range(i + 1, len(state)):
+            if remain[i] and remain[k] and same(state[i], state[k], longest, widest):
+                join(state[i], state[k])
+                remain[k] = False
+    return remain

@@ -25,6 +25,10 @@ SEEN = kalman.STATE
 FULL_TURN = 2.0 * np.pi
 HEADING_M_S = 1.0
 REST_M = 0.5
+LEAST_THROUGH = 3
+UPRIGHT_M = 0.4
+"""Things stand upright: rings of the sensor on the ground, which run along with the vehicle, do not."""
+SIZE_QUANTILE = 0.7
 TOP_MARGIN_M = 0.1
 PERSON_M, CYCLIST_M, CYCLIST_WIDTH_M, TRUCK_M = 1.1, 2.4, 1.2, 6.5
 PERSON_M_S = 3.0
@@ -49,12 +53,14 @@ class ObjectPath:
 
 def object_path(settings: Settings, history: History, scan_index: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> ObjectPath | None:  # fmt: skip
     """The path of a track that moved, or None; scans and their stamps are those of the odometry."""
-    score = history.through / max(history.through + history.taken, 1)
-    if len(history.scans) < settings.min_scans or history.scans_through < settings.min_scans:
-        return None
-    if score < settings.min_score:
+    told = np.array(history.asked)
+    moving = (told[:, 0] >= LEAST_THROUGH) & (told[:, 0] > 2 * told[:, 1])
+    score = float(told[:, 0].sum() / max(told.sum(), 1))
+    if np.count_nonzero(moving) < settings.min_scans or score < settings.min_score:
         return None
     seen = _upright(np.array(history.rows))
+    if np.count_nonzero(seen[:, SEEN + kalman.UPRIGHT] >= UPRIGHT_M) < settings.min_scans:
+        return None
     size = _final_size(seen)
     first, last = np.searchsorted(scan_index, [history.scans[0], history.scans[-1]])
     rows = np.arange(first, last + 1)
@@ -87,8 +93,8 @@ def _upright(rows: F8) -> F8:
     owed = np.concatenate((np.cumsum(quarters[::-1])[::-1], [0]))
     odd = owed % 2 != 0
     out[:, kalman.YAW] += 0.5 * np.pi * owed
-    lw = [kalman.LENGTH, kalman.WIDTH]
-    out[np.ix_(odd, lw)] = out[np.ix_(odd, lw[::-1])]
+    for pair in ([kalman.LENGTH, kalman.WIDTH], [kalman.LENGTH_KNOWN, kalman.WIDTH_KNOWN]):
+        out[np.ix_(odd, pair)] = out[np.ix_(odd, pair[::-1])]
     grows = out[:, [SEEN + kalman.GROWS_U, SEEN + kalman.GROWS_V]]
     for turned in range(4):
         at = owed % 4 == turned

@@ -31,7 +31,7 @@ class Settings(BaseModel):
     )
     min_scans: int = Field(3, ge=2, le=50, description="nor what was seen in fewer scans, number")
     min_score: float = Field(
-        0.7,
+        0.8,
         ge=0.0,
         le=1.0,
         description="share of the places it left, or came to, that were seen to be empty, number",

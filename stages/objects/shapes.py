@@ -22,7 +22,7 @@ MOST_POINTS = 120
 """A direction is sought with so many points at most."""
 FACING_M = 0.08
 """Standard deviation of a side that faces the LiDAR."""
-GRAZING = 0.12
+GRAZING = 0.17
 """A side seen at less than this sine of an angle does not show where it ends."""
 NEARER_M = 0.5
 OUTSIDE = (2, 7)

@@ -26,7 +26,7 @@ MOVED_M = 0.4
 """Free space is asked of tracks that moved by this between two scans."""
 YOUNG = 3.0
 YOUNG_REACH_M = 2.5
-LOST_REACH_M = 1.2
+LOST_REACH_M = 0.6
 SAME_SIZE = 2.0
 LEAST_TRACK_POINTS = 3
 LOWEST_TOP_M = 0.5
@@ -39,10 +39,8 @@ class History:
     rows: list[F8] = field(default_factory=list)
     """(kalman.STATE + kalman.SEEN,) of each update."""
     scans: list[int] = field(default_factory=list)
-    through: int = 0
-    taken: int = 0
-    scans_through: int = 0
-    """Scans in which free space said that it moved."""
+    asked: list[tuple[int, int]] = field(default_factory=list)
+    """Of each update: how many places were seen to be empty that it had left or came to, and how many were not."""
 
 
 class Tracker:
@@ -66,8 +64,9 @@ class Tracker:
         starts, order = grouped(owner, len(self._state))
         seen = update_all(scan.band, starts, order, self._state, scan.origin, scan.ground, scan.starts, scan.returns, step_rad)  # fmt: skip
         self._remember(seen, scan_index)
-        self._ask(scan, stamp_ns, starts, order)
+        self._ask(scan, stamp_ns, seen, starts, order)
         self._keep_reference(scan, stamp_ns, starts, order)
+        self._merge()
         self._begin(scan, owner, label, count, scan_index, step_rad)
         return self._ended()
 
@@ -93,8 +92,9 @@ class Tracker:
             history = self._histories[self._ids[m]]
             history.rows.append(np.concatenate((self._state[m], seen[m])))
             history.scans.append(scan_index)
+            history.asked.append((0, 0))
 
-    def _ask(self, scan: VirtualScan, stamp_ns: int, starts: I4, order: I4) -> None:
+    def _ask(self, scan: VirtualScan, stamp_ns: int, seen: F8, starts: I4, order: I4) -> None:
         """Hold the present scan and earlier ones against each other, for tracks that moved between them."""
         for age in AGES_S:
             reference = self._of_age(stamp_ns, age)
@@ -103,7 +103,7 @@ class Tracker:
             boxes = self._boxes()
             rows = [
                 (m, reference.number[i]) for m, i in enumerate(self._ids)
-                if i in reference.number and starts[m + 1] > starts[m]
+                if i in reference.number and seen[m, kalman.POINTS] > 0
             ]  # fmt: skip
             for m, r in rows:
                 if np.hypot(*(boxes[m, :2] - reference.boxes[r, :2])) < MOVED_M:
@@ -117,11 +117,9 @@ class Tracker:
         b = asked(
             now, reference.boxes[r], reference.scan.origin, reference.scan.starts, reference.scan.returns
         )
-        through, taken = a[0] + b[0], a[1] + b[1]
-        history = self._histories[self._ids[m]]
-        history.through += through
-        history.taken += taken
-        history.scans_through += through >= 3 and through > 2 * taken
+        asked_here = self._histories[self._ids[m]].asked
+        through, taken = asked_here[-1]
+        asked_here[-1] = (through + a[0] + b[0], taken + a[1] + b[1])
 
     def _of_age(self, stamp_ns: int, age_s: float) -> Reference | None:
         """The kept scan of about that age."""
@@ -162,9 +160,21 @@ class Tracker:
         slim = np.minimum(fresh[:, kalman.LENGTH], fresh[:, kalman.WIDTH]) <= s.widest_m
         for row in np.column_stack((fresh, seen))[slim]:
             self._ids.append(self._next)
-            self._histories[self._next] = History([row], [scan_index])
+            self._histories[self._next] = History([row], [scan_index], [(0, 0)])
             self._next += 1
         self._state = np.concatenate((self._state, fresh[slim]))
+
+    def _merge(self) -> None:
+        """Parts of one thing that were taken for several become one track, the oldest of them."""
+        remain = kalman.merged(self._state, self._settings.longest_m, self._settings.widest_m)
+        if not remain.all():
+            for m in np.flatnonzero(~remain):
+                del self._histories[self._ids[m]]
+            self._keep(remain)
+
+    def _keep(self, kept: NDArray[np.bool_]) -> None:
+        self._ids = [self._ids[m] for m in np.flatnonzero(kept)]
+        self._state = np.ascontiguousarray(self._state[kept])
 
     def _ended(self) -> list[History]:
         """Take out the tracks that are lost, or have become something that is no object."""
@@ -175,8 +185,7 @@ class Tracker:
         large |= np.minimum(state[:, kalman.LENGTH], state[:, kalman.WIDTH]) > s.widest_m
         kept = ~(lost | large)
         gone = [self._histories.pop(self._ids[m]) for m in np.flatnonzero(~kept)]
-        self._ids = [self._ids[m] for m in np.flatnonzero(kept)]
-        self._state = np.ascontiguousarray(state[kept])
+        self._keep(kept)
         return gone
 
 
