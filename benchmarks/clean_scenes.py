@@ -42,8 +42,7 @@ CLEANING = ("rays", "clean", "relabel")
 LEFT_OUT = (PointClass.EGO, PointClass.OUT_OF_RANGE)
 REAL = Path("../shared/data/kitti_raw_0005")
 TRUE, ESTIMATED = "truth", "estimated"
-
-_TOWN: dict[str, Any] = {"start_m": 0.0, "duration_s": 60.0}
+RESTS_M_S, DRIVES_M_S, WAITS_SCANS = 0.1, 1.0, 30
 
 
 @dataclass(frozen=True)
@@ -52,18 +51,30 @@ class Place:
 
     drive: Drive
     poses: tuple[str, ...] = (TRUE, ESTIMATED)
-    objects: bool = True
-    """Something moves in it."""
 
 
-PLACES: Mapping[str, Place] = {
-    "town_32": Place(Drive("town_32", "town, 32 beams", {**_TOWN, "beams": 32})),
-    "town_64": Place(Drive("town_64", "town, 64 beams", {**_TOWN, "duration_s": 40.0, "beams": 64})),
-    "quiet": Place(
-        Drive("quiet", "town without traffic", {**_TOWN, "duration_s": 40.0, "traffic": False}), objects=False
-    ),
-    "kitti_0005": Place(Drive("kitti_0005", "KITTI 0005", folder=REAL), (ESTIMATED,)),
-}
+_BUSY: dict[str, Any] = {"duration_s": 60.0, "busy": True}
+_QUIET: dict[str, Any] = {"traffic": False, "dust_per_m": 0.0}
+_SNOW: dict[str, Any] = {"start_m": 20.0, "duration_s": 20.0, "snow_per_m": 0.0035}
+_DUST: dict[str, Any] = {"start_m": 620.0, "duration_s": 20.0, "dust_clouds": 0.8}
+
+
+def places(seed: int = 0) -> dict[str, Place]:
+    """All scenes; with another seed than 0 in another town, with other traffic and other noise."""
+    seeds = {"seed": seed, "town_seed": seed, "parking_seed": seed} if seed else {}
+    end = f"_{seed}" if seed else ""
+
+    def town(name: str, title: str, more: Mapping[str, Any]) -> Place:
+        return Place(Drive(name + end, title, {"beams": 32, **more, **seeds}))
+
+    return {
+        "town_32": town("town_32", "busy town, 32 beams", _BUSY),
+        "town_64": town("town_64", "busy town, 64 beams", {**_BUSY, "duration_s": 40.0, "beams": 64}),
+        "quiet": town("quiet", "town without traffic", {"duration_s": 40.0, **_QUIET}),
+        "snow": town("snow", "snowfall in town", _SNOW),
+        "dust": town("dust", "clouds of dust", _DUST),
+        "kitti_0005": Place(Drive("kitti_0005", "KITTI 0005", folder=REAL), (ESTIMATED,)),
+    }
 
 
 @dataclass(frozen=True)
@@ -85,13 +96,12 @@ class Scene:
     stamp_ns: NDArray[np.int64]
     poses: Mapping[str, F8]
     """(m, 4, 4) poses of the LiDAR by name of the set; each starts near its origin."""
-    kinds: Mapping[int, str]
-    """What the objects are, by number."""
+    kinds: Mapping[str, Sequence[int]]
+    """Numbers of the objects of each kind; one may be of several."""
     files: Mapping[str, Sequence[str]]
     """Where the products lie, by name."""
     inputs: Mapping[str, str]
     """Digest of points and poses by set of poses."""
-    objects: bool
 
     def __len__(self) -> int:
         """Number of scans."""
@@ -185,7 +195,10 @@ def _near_origin(T: F8) -> F8:
     return moved
 
 
-def _simulated(result: Result, folder: Path) -> dict[int, str]:
+Kinds = dict[str, list[int]]
+
+
+def _simulated(result: Result, folder: Path) -> Kinds:
     """Points with the simulator's own truth; what its objects are."""
     (log,) = (path for _, path in result.files(TruthLog))
     true = iter(TruePoints.open(log / "points.parquet"))
@@ -193,14 +206,24 @@ def _simulated(result: Result, folder: Path) -> dict[int, str]:
         folder,
         ((scan, labels, _same(scan, next(true))) for scan, labels in scans_of(result)),
     )
-    return {**_named(log / "objects.parquet", TrueObjects), **_named(log / "tracks.parquet", TrueTracks)}
+    standing = TrueObjects.open(log / "objects.parquet")
+    moving = TrueTracks.open(log / "tracks.parquet")
+    kinds = _by_name(standing.what, standing.instance)
+    kinds |= {f"moving_{what}": numbers for what, numbers in _by_name(moving.what, moving.instance).items()}
+    return kinds | {"waiting_car": waiting_cars(moving)}
 
 
-def _named(path: Path, table: type[TrueObjects] | type[TrueTracks]) -> dict[int, str]:
-    """What the objects of a table are; those that move are called so."""
-    listed = table.open(path)
-    moving = "moving " if table is TrueTracks else ""
-    return {int(n): f"{moving}{what}" for n, what in zip(listed.instance, listed.what)}
+def _by_name(what: NDArray[np.object_], instance: NDArray[np.uint16]) -> Kinds:
+    return {name: sorted({int(n) for n in instance[what == name]}) for name in sorted(set(what))}
+
+
+def waiting_cars(moving: TrueTracks) -> list[int]:
+    """Numbers of the cars that are seen to stand for three seconds and more, and to drive at another time."""
+    counts = (moving.what == "car") & (moving.class_ == PointClass.DYNAMIC) & (moving.points > 0)
+    rested = moving.instance[counts & (moving.speed_m_s < RESTS_M_S)]
+    drove = moving.instance[counts & (moving.speed_m_s > DRIVES_M_S)]
+    numbers, scans = np.unique(rested, return_counts=True)
+    return [int(n) for n in numbers[scans >= WAITS_SCANS] if n in drove]
 
 
 def _same(scan: DeskewedScan, true: TrueLabels) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
@@ -209,15 +232,18 @@ def _same(scan: DeskewedScan, true: TrueLabels) -> tuple[NDArray[np.uint8], NDAr
     return true.class_, true.instance
 
 
-def _measured(place: Place, result: Result, folder: Path, T: F8) -> dict[int, str]:
+def _measured(place: Place, result: Result, folder: Path, T: F8) -> Kinds:
     """Points with boxes as truth: what is in none is not judged."""
     assert place.drive.folder is not None
     tracks: list[BoxTrack] = read_boxes(place.drive.folder / LABELS, T)
     rows = ((scan, labels, boxed(scan, tracks, UNJUDGED)) for scan, labels in scans_of(result))
     _write(folder, rows)
-    return {
-        track.number: f"{'moving' if track.moving else 'parked'} {track.what.lower()}" for track in tracks
-    }
+    kinds: Kinds = {}
+    for track in tracks:
+        kinds.setdefault(f"{'moving' if track.moving else 'parked'}_{track.what.lower()}", []).append(
+            track.number
+        )
+    return kinds
 
 
 def scans_of(result: Result) -> Iterator[tuple[DeskewedScan, ScanLabels]]:
@@ -262,8 +288,7 @@ def _opened(place: Place, folder: Path) -> Scene:
         starts=array("starts"),
         stamp_ns=array("stamp_ns"),
         poses={name: array(f"T_{name}") for name in place.poses},
-        kinds={int(number): what for number, what in described["kinds"].items()},
+        kinds=described["kinds"],
         files=described["files"],
         inputs=described["inputs"],
-        objects=place.objects,
     )

@@ -1,8 +1,8 @@
 """The systems that clean: which points of a scene each keeps, and how long it takes. All get the same points and poses.
 
 DUFOMap (Duberg, Zhang, Jia, Jensfelt, RA-L 2024) runs with the parameters its authors publish for all sensors: voxels of
-0.1 m, d_s 0.2 m, hits extended, d_p 1 (the paper, the repository's configuration) or 2 (its Python example). Where both are
-run the better one stands for it.
+0.1 m, d_s 0.2 m, hits extended, d_p 1 (the paper, the repository's configuration) or 2 (its Python example). The first does
+better in our scenes; where both are run the better one stands for the system.
 """
 
 from __future__ import annotations

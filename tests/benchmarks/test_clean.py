@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.clean_boxes import BoxTrack, boxed, in_box, moves
 from benchmarks.clean_nearness import near
+from benchmarks.clean_scenes import WAITS_SCANS, waiting_cars
 from benchmarks.clean_scores import (
     UNJUDGED,
     Accuracy,
@@ -18,6 +19,7 @@ from benchmarks.clean_scores import (
     may_stand,
 )
 from scanloom.schemas.scans import DeskewedScan, PointClass
+from scanloom.schemas.simulated import TrueTracks
 from scanloom.stages.geometry.se3 import F8, pose, so3_exp
 
 
@@ -158,3 +160,28 @@ def track(speed: float, frames: int) -> tuple[dict[int, F8], F8]:
 )
 def test_what_moves_by_its_boxes(speed: float, frames: int, expected: bool) -> None:
     assert moves(*track(speed, frames)) is expected
+
+
+def seen(number: int, speeds: list[float], **changed: object) -> TrueTracks:
+    n = len(speeds)
+    zeros = np.zeros(n)
+    columns: dict[str, object] = {
+        "scan_index": np.arange(n), "instance": np.full(n, number, np.uint16), "what": np.array(["car"] * n, object),
+        "class_": np.full(n, PointClass.DYNAMIC, np.uint8), "points": np.ones(n, np.uint32), "x_m": zeros, "y_m": zeros,
+        "z_m": zeros, "yaw_rad": zeros, "length_m": zeros, "width_m": zeros, "height_m": zeros,
+        "speed_m_s": np.array(speeds),
+    }  # fmt: skip
+    return TrueTracks(**(columns | changed))
+
+
+def test_a_car_waits_when_it_is_seen_to_rest_and_to_drive() -> None:
+    n = WAITS_SCANS
+    tracks = [
+        seen(1, [0.0] * n + [5.0]),
+        seen(2, [0.0] * (n - 1) + [5.0]),
+        seen(3, [0.0] * (n + 5)),
+        seen(4, [5.0] * (n + 5)),
+        seen(5, [0.0] * n + [5.0], points=np.zeros(n + 1, np.uint32)),
+        seen(6, [0.0] * n + [5.0], what=np.array(["bus"] * (n + 1), object)),
+    ]
+    assert waiting_cars(TrueTracks.concatenate(tracks)) == [1]
