@@ -26,7 +26,7 @@ class Standing(IntEnum):
     MOVED = 2
     """Seen through by the session itself at other times: what was met there passed, or left."""
     CHANGED = 3
-    """Stood while this session passed; another one saw through it."""
+    """Stood while this session passed; a later one saw through it."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,7 @@ class Rays(Table):
     )
     between: NDArray[np.uint8] = column("u1", "the same between hits", shape=(BRICK_VOXELS,))
     after: NDArray[np.uint8] = column("u1", "the same after the last hit", shape=(BRICK_VOXELS,))
+    first_ns: int = attribute("reference time of the chunk's first scan, ns")
     voxel_size_m: float = attribute("edge of a voxel, m")
     tile_size_m: float = attribute("edge of a tile, m")
     frame: str = attribute("`world` or `map`")

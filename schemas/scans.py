@@ -24,7 +24,7 @@ class PointClass(IntEnum):
     OUTLIER = 6
     OUT_OF_RANGE = 7
     CHANGED = 8
-    """Stood while one session passed and was gone when another did."""
+    """Stood while one session passed and was gone when a later one did."""
 
 
 class Cloud:

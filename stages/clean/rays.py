@@ -55,13 +55,14 @@ def rays(settings: Settings, deskewed: Deskewed, labels: Labels, poses: Poses) -
     Memory is bounded by the space that the chunk sees.
     """
     T_of = {int(i): T for i, T in zip(poses.scan_index, poses.T_world_lidar) if np.isfinite(T).all()}
-    field, image = VoxelField(), incidence.new_image()
+    field, image, first_ns = VoxelField(), incidence.new_image(), 0
     for number, pairs in enumerate(_bins(deskewed, labels, settings.bin_s), start=1):
+        first_ns = first_ns or pairs[0][0].reference_ns
         placed = [
             (*_seen(scan, label), T_of[scan.scan_index]) for scan, label in pairs if scan.scan_index in T_of
         ]
         _mark(settings, field, image, field.stamp(number), placed)
-    yield from _parts(settings, field, poses.frame)
+    yield from _parts(settings, field, first_ns, poses.frame)
 
 
 def _bins(deskewed: Deskewed, labels: Labels, bin_s: float) -> Iterator[list[Pair]]:
@@ -102,7 +103,7 @@ def _until_done(field: VoxelField, kernel: object, arguments: tuple, count: int)
         field.grow()
 
 
-def _parts(settings: Settings, field: VoxelField, frame: str) -> Iterator[Part[Rays]]:
+def _parts(settings: Settings, field: VoxelField, first_ns: int, frame: str) -> Iterator[Part[Rays]]:
     brick_m = BRICK_SIDE * settings.voxel_size_m
     for name, rows in bricks_by_tile(field.bricks, brick_m, settings.tile_size_m, settings.voxel_size_m):
         layers = field.voxels[rows]
@@ -113,6 +114,7 @@ def _parts(settings: Settings, field: VoxelField, frame: str) -> Iterator[Part[R
                 before=np.ascontiguousarray(layers[:, BEFORE]),
                 between=np.ascontiguousarray(layers[:, BETWEEN]),
                 after=np.ascontiguousarray(layers[:, AFTER]),
+                first_ns=first_ns,
                 voxel_size_m=settings.voxel_size_m,
                 tile_size_m=settings.tile_size_m,
                 frame=frame,

@@ -31,6 +31,8 @@ U1 = NDArray[np.uint8]
 B1 = NDArray[np.bool_]
 I8 = NDArray[np.int64]
 JUDGED = (PointClass.UNLABELLED, PointClass.STATIC)
+DECIDED = ((Standing.CHANGED, PointClass.CHANGED), (Standing.MOVED, PointClass.DYNAMIC))
+"""What a verdict makes of a point; the last word is the second's."""
 
 
 class Settings(BaseModel):
@@ -45,7 +47,13 @@ class Settings(BaseModel):
         description="neighbours in a scan whose ranges differ by less belong together, m",
     )
     moved_share: float = Field(
-        0.4, ge=0.05, le=1.0, description="a thing moved as a whole when this share of its points did"
+        0.4,
+        ge=0.05,
+        le=1.0,
+        description="a thing moved as a whole when this share of its points did, what stands left aside",
+    )
+    whole_share: float = Field(
+        0.6, ge=0.05, le=1.0, description="the same of a thing with all that hangs on it, even if that stands"
     )
     least_points: int = Field(
         5, ge=1, le=1000, description="points that hang together are a thing from this number on"
@@ -129,11 +137,15 @@ def final(settings: Settings, scan: DeskewedScan, classes: U1, known: _Map) -> U
     said = known.verdicts.of(scan, judged, T_world_lidar)
     boxed = judged & _boxed(settings, scan, known.boxes(scan), said)
     said[boxed] = Standing.MOVED
-    thing = _things(settings, scan, judged & (said != Standing.STANDS), known.image)
     out = classes.copy()
-    for standing_, class_ in ((Standing.CHANGED, PointClass.CHANGED), (Standing.MOVED, PointClass.DYNAMIC)):
-        told = said == standing_
-        out[told | (judged & _with_the_rest(settings, thing, told))] = class_
+    for usable, least in (
+        (judged, settings.whole_share),
+        (judged & (said != Standing.STANDS), settings.moved_share),
+    ):
+        thing = _things(settings, scan, usable, known.image)
+        for standing, class_ in DECIDED:
+            told = said == standing
+            out[told | (usable & _of_such(thing, told, settings.least_points, least))] = class_
     return out
 
 
@@ -155,9 +167,9 @@ def _things(
     return found
 
 
-def _with_the_rest(settings: Settings, thing: NDArray[np.int32], told: B1) -> B1:
+def _of_such(thing: NDArray[np.int32], told: B1, least_points: int, least_share: float) -> B1:
     """Points (n,) of things of which enough points are told."""
     points = np.bincount(thing, minlength=len(thing))
     share = np.bincount(thing, weights=told, minlength=len(thing)) / np.maximum(points, 1)
-    moved = (points >= settings.least_points) & (share >= settings.moved_share)
-    return moved[thing]
+    whole = (points >= least_points) & (share >= least_share)
+    return whole[thing]

@@ -1,7 +1,7 @@
 """Clean: which voxels of a tile held something that passed, left, or changed between sessions.
 
 All that the rays of all chunks and sessions say of a tile is added up in the order of time. What a session met in a voxel
-moved if its own rays saw through the voxel at other times; it has changed if those of other sessions did. Labels only: what is
+moved if its own rays saw through the voxel at other times; it has changed if those of later sessions did. Labels only: what is
 to become of such points is decided in tiling. One tile needs no other; memory is bounded by the tile and its sessions are
 gone through one by one. Source: methods 1.5.1 (free-space conflict).
 """
@@ -13,11 +13,11 @@ from collections.abc import Iterator
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from scanloom.schemas.clean import BRICK_SIDE, Cleared, Rays, Standing
+from scanloom.schemas.clean import BRICK_SIDE, BRICK_VOXELS, Cleared, Rays, Standing
 from scanloom.schemas.product import Part, Parts
 from scanloom.stages.clean.evidence import MOST, U2, Evidence, all_bricks
 from scanloom.stages.clean.tiles import brick_indices
-from scanloom.stages.clean.verdicts import U1, judge_others, judge_own
+from scanloom.stages.clean.verdicts import U1, judge_later, judge_own
 
 VERSION = 1
 
@@ -43,42 +43,37 @@ class Settings(BaseModel):
         0.3, ge=0.0, le=1.0, description="stands: seen through at most this many times as often as met, ratio"
     )
     changed_bins: int = Field(
-        5, ge=1, le=1000, description="changed: other sessions saw through it in so many bins"
+        5, ge=1, le=1000, description="changed: later sessions saw through it in so many bins"
     )
     changed_hits: float = Field(
         0.05,
         ge=0.0,
         le=1.0,
-        description="changed: bins of other sessions that met something over free ones, at most",
+        description="changed: bins of later sessions that met something over free ones, at most",
     )
 
 
 def clean(settings: Settings, rays: Parts[Rays]) -> Iterator[Part[Cleared]]:
-    """Verdicts on the voxels of one tile for each session that passed it."""
-    order, where = _by_session(rays), rays.coordinates()[0]["tile"]
-    bricks = all_bricks(rays[n] for numbers in order.values() for n in numbers)
-    several = len(order) > 1
-    total = np.zeros((2, *Evidence.of(bricks).hits.shape), np.uint32) if several else None
-    if total is not None:
-        for numbers in order.values():
-            evidence = _evidence(bricks, rays, numbers)
-            total[0] += evidence.hits
-            total[1] += evidence.through
+    """Verdicts on the voxels of one tile for each session that passed it, the latest first."""
+    order, where = _latest_first(rays), rays.coordinates()[0]["tile"]
+    bricks = all_bricks(rays)
+    later = np.zeros((2, len(bricks), BRICK_VOXELS), np.uint32)
     for session, numbers in order.items():
         evidence = _evidence(bricks, rays, numbers)
         verdict = _own(settings, evidence)
-        if total is not None:
-            _changed(settings, evidence, verdict, total)
-        _only_own(evidence.bricks, verdict, where, rays[0])
+        _changed(settings, evidence, verdict, later)
+        later[0] += evidence.hits
+        later[1] += evidence.through
+        _only_own(bricks, verdict, where, rays[0])
         yield Part(_cleared(evidence, verdict, rays[0]), session)
 
 
-def _by_session(rays: Parts[Rays]) -> dict[str, list[int]]:
-    """Numbers of the parts of each session; chunks are numbered in the order of time."""
+def _latest_first(rays: Parts[Rays]) -> dict[str, list[int]]:
+    """Numbers of the parts of each session, chunk by chunk in the order of time; the session that came last is first."""
     numbers: dict[str, list[int]] = {}
     for n, where in enumerate(rays.coordinates()):
         numbers.setdefault(where["session"], []).append(n)
-    return numbers
+    return dict(sorted(numbers.items(), key=lambda item: (-rays[item[1][0]].first_ns, item[0])))
 
 
 def _evidence(bricks: np.ndarray, rays: Parts[Rays], numbers: list[int]) -> Evidence:
@@ -96,11 +91,9 @@ def _own(settings: Settings, evidence: Evidence) -> U1:
     return verdict
 
 
-def _changed(settings: Settings, evidence: Evidence, verdict: U1, total: np.ndarray) -> None:
-    other_hits = _capped(total[0] - evidence.hits)
-    other_through = _capped(total[1] - evidence.through)
-    judge_others(
-        evidence.bricks, evidence.keys, evidence.rows, verdict, evidence.hits, other_hits, other_through,
+def _changed(settings: Settings, evidence: Evidence, verdict: U1, later: np.ndarray) -> None:
+    judge_later(
+        evidence.bricks, evidence.keys, evidence.rows, verdict, evidence.hits, _capped(later[0]), _capped(later[1]),
         settings.changed_bins, settings.changed_hits,
     )  # fmt: skip
 

@@ -44,16 +44,16 @@ def judge_own(
 
 
 @kernel
-def judge_others(
-    bricks: I8, keys: I8, rows: I4, verdict: U1, hits: U2, other_hits: U2, other_through: U2, away_bins: int, share: float
+def judge_later(
+    bricks: I8, keys: I8, rows: I4, verdict: U1, hits: U2, later_hits: U2, later_through: U2, away_bins: int, share: float
 ) -> None:  # fmt: skip
-    """Turn into CHANGED, in place, what stood for this session and others saw through, hardly ever meeting anything."""
+    """Turn into CHANGED, in place, what stood for this session and later ones saw through, hardly ever meeting anything."""
     for n in range(len(bricks)):
         for q in range(hits.shape[1]):
             if hits[n, q] == 0 or verdict[n, q] == MOVED:
                 continue
-            v, h = np.int64(other_through[n, q]), np.int64(other_hits[n, q])
-            if v >= away_bins and h <= share * v and open_around(bricks[n], q, n, keys, rows, other_through):
+            v, h = np.int64(later_through[n, q]), np.int64(later_hits[n, q])
+            if v >= away_bins and h <= share * v and open_around(bricks[n], q, n, keys, rows, later_through):
                 verdict[n, q] = CHANGED
 
 
