@@ -12,14 +12,19 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import subprocess
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
+from benchmarks import clean_page
+from benchmarks.clean_gathering import ESTIMATED
 from benchmarks.clean_nearness import F4, Mask
-from benchmarks.clean_scenes import ESTIMATED, Scene, places, scene
+from benchmarks.clean_ours import tracking_ms
+from benchmarks.clean_scenes import Scene, places, scene
 from benchmarks.clean_scores import (
     Accuracy,
     accuracy,
@@ -29,7 +34,7 @@ from benchmarks.clean_scores import (
     kept_in_map,
     may_stand,
 )
-from benchmarks.clean_systems import SYSTEMS, Outcome, System, classify
+from benchmarks.clean_systems import OURS, PEER, SYSTEMS, Outcome, System, classify
 from benchmarks.clean_utility import entropy_scores, localisation, localisation_scores
 from benchmarks.scores import Figure, Score
 
@@ -54,9 +59,12 @@ def main(words: Sequence[str] | None = None) -> None:
             console.print(f"{name} is left out: there are no scans at {place.drive.folder}")
             continue
         found = scene(place, options.store, WORK / "clean")
+        if options.times:
+            figures += _shown(_times(found.first(options.times), place.poses[-1], systems))
+            continue
         for poses in place.poses:
             figures += _shown(_of_scene(found, poses, systems, options))
-    _write(figures, options.json)
+    _write([figure for figure in figures if np.isfinite(figure.value)], options)
 
 
 def _options(words: Sequence[str] | None) -> argparse.Namespace:
@@ -80,8 +88,12 @@ def _options(words: Sequence[str] | None) -> argparse.Namespace:
         action="store_true",
         help="every published parameter of DUFOMap, not only the best known",
     )
+    parser.add_argument(
+        "--times", type=int, default=0, metavar="CHUNKS", help="time alone, of so many chunks of each scene"
+    )
     parser.add_argument("--quick", action="store_true", help="accuracy and time alone")
     parser.add_argument("--json", default="", help="file for the figures, or - for standard output")
+    parser.add_argument("--page", type=Path, help="page of the documentation whose tables are written anew")
     return parser.parse_args(words)
 
 
@@ -93,6 +105,21 @@ def _settings(words: Sequence[str]) -> dict[str, dict[str, float]]:
         stage, _, field = name.partition(".")
         chosen.setdefault(stage, {})[field] = json.loads(value)
     return chosen
+
+
+def _times(found: Scene, poses: str, systems: Sequence[System]) -> Iterator[Figure]:
+    """Time alone, of each system one after the other on the same scans, and of the tracker that ours listens to."""
+    for system in systems:
+        outcome = classify(system, system.variants[0], found, poses, {}, fresh=True)
+        if np.isfinite(outcome.ms_per_scan):
+            name = f"{PREFIX}.{found.name}.{system.name}.ms_per_scan"
+            how = f"mean wall time of {len(found)} scans, without reading; {outcome.how}"
+            yield Figure(name, outcome.ms_per_scan, "ms", found.name, how)
+    if any(system.name == OURS for system in systems):
+        how = f"mean wall time of {len(found)} scans, one process; boxes that relabel reads"
+        yield Figure(
+            f"{PREFIX}.{found.name}.{OURS}.objects_ms_per_scan", tracking_ms(found), "ms", found.name, how
+        )
 
 
 def _there(system: System) -> bool:
@@ -185,12 +212,25 @@ def _time(outcome: Outcome) -> Iterator[Score]:
         yield Score("ms_per_scan", outcome.ms_per_scan, "ms", "mean wall time, without reading")
 
 
-def _write(figures: Sequence[Figure], where: str) -> None:
-    text = json.dumps([figure.row() for figure in figures if np.isfinite(figure.value)], indent=1)
-    if where == "-":
+def _write(figures: Sequence[Figure], options: argparse.Namespace) -> None:
+    text = json.dumps([figure.row() for figure in figures], indent=1)
+    for line in clean_page.tables(figures):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    if options.page:
+        clean_page.fill(options.page, figures, _remark())
+    if options.json == "-":
         print(text)
-    elif where:
-        Path(where).write_text(text + "\n")
+    elif options.json:
+        Path(options.json).write_text(text + "\n")
+
+
+def _remark() -> str:
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True
+    ).stdout.strip()
+    cores = len(os.sched_getaffinity(0))
+    peer = SYSTEMS[PEER].version() or "not there"
+    return f"Measured at commit {commit or 'unknown'}, {cores} cores, DUFOMap {peer}."
 
 
 if __name__ == "__main__":

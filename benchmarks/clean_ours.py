@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.clean_scenes import LEFT_OUT, Scene, of_session
+from benchmarks.clean_gathering import LEFT_OUT
+from benchmarks.clean_scenes import Scene, of_session
 from benchmarks.sequences import NODE_OF
 from scanloom.schemas.clean import Cleared, FinalLabels, Rays
 from scanloom.schemas.product import Coordinate, Part, Parts, Product
@@ -101,7 +102,9 @@ def job(scene: Scene, poses: str, settings: Settings, folder: Path) -> Job:
     session = {p: p.open(Path(scene.files[p.NAME][0])) for p in of_session()}
     estimated = session[Poses]
     assert isinstance(estimated, Poses)
-    placed = dataclasses.replace(estimated, T_world_lidar=np.array(scene.poses[poses]))
+    placed = dataclasses.replace(
+        estimated.take(slice(0, len(scene))), T_world_lidar=np.array(scene.poses[poses])
+    )
     return Job(deskewed, labels, {**session, Poses: placed}, settings, folder)
 
 
@@ -154,13 +157,10 @@ def _tile(file: tuple[Coordinate, Path]) -> str:
 
 def _load_kernels(work: Job) -> None:
     """The stages once, on the first scans."""
-    deskewed, labels = work.deskewed[0], work.labels[0]
-    few = range(min(WARM_UP, len(deskewed)))
     with tempfile.TemporaryDirectory(prefix="clean-") as folder:
         small = dataclasses.replace(
-            work, deskewed=[Deskewed([deskewed[k] for k in few])], labels=[Labels([labels[k] for k in few])],
-            folder=Path(folder),
-        )  # fmt: skip
+            work, deskewed=[_few(work.deskewed[0])], labels=[_few(work.labels[0])], folder=Path(folder)
+        )
         rays = sorted(small.rays(0), key=_tile)
         cleared = [
             file
@@ -175,3 +175,28 @@ def cleaned(scene: Scene, poses: str, settings: Settings) -> tuple[NDArray[np.ui
     with tempfile.TemporaryDirectory(prefix="clean-") as folder:
         classes, seconds = final_classes(job(scene, poses, settings, Path(folder)))
     return classes, 1e3 * seconds / len(scene)
+
+
+def tracking_ms(scene: Scene) -> float:
+    """ms per scan of the tracker, whose boxes `relabel` reads: one process, scans in memory."""
+    where = [(*SESSION, ("chunk", f"{k:04d}")) for k in range(len(scene.files[Labels.NAME]))]
+    deskewed = [Deskewed([*Deskewed.open(Path(path))]) for path in scene.files[Deskewed.NAME]]
+    labels = [Labels([*Labels.open(Path(path))]) for path in scene.files[Labels.NAME]]
+    given = {
+        Deskewed: Parts(zip(where, deskewed)), Labels: Parts(zip(where, labels)),
+        **{p: p.open(Path(scene.files[p.NAME][0])) for p in NODE_OF["objects"].reads if p not in (Deskewed, Labels)},
+    }  # fmt: skip
+    node = NODE_OF["objects"]
+    few = {
+        **given,
+        Deskewed: Parts([(where[0], _few(deskewed[0]))]),
+        Labels: Parts([(where[0], _few(labels[0]))]),
+    }
+    node.stage(node.settings(), *(few[product] for product in node.reads))
+    started = time.perf_counter()
+    node.stage(node.settings(), *(given[product] for product in node.reads))
+    return 1e3 * (time.perf_counter() - started) / len(scene)
+
+
+def _few(stream: Any) -> Any:
+    return type(stream)([stream[k] for k in range(min(WARM_UP, len(stream)))])

@@ -6,10 +6,11 @@ systems. Where there is truth of poses there are two sets of them: true ones, an
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,32 +18,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.clean_boxes import LABELS, BoxTrack, boxed, read_boxes
-from benchmarks.clean_scores import UNJUDGED
+from benchmarks.clean_gathering import ESTIMATED, TRUE, gather
 from benchmarks.sequences import NODE_OF, Drive, produced
 from scanloom.pipeline.run import Result
 from scanloom.schemas.product import Product
 from scanloom.schemas.scans import (
     Deskewed,
-    DeskewedScan,
     Labels,
-    PointClass,
-    ScanLabels,
-    TrueLabels,
-    TruePoints,
 )
-from scanloom.schemas.session import TruthLog
-from scanloom.schemas.simulated import TrueObjects, TrueTracks
-from scanloom.schemas.trajectory import Poses, Truth
-from scanloom.stages.geometry.interpolation import interpolate_poses
+from scanloom.schemas.session import Session, TruthLog
+from scanloom.schemas.trajectory import Odometry, Truth
 from scanloom.stages.geometry.se3 import F8
 
 CLEANING = ("rays", "clean", "relabel")
 """Our stages that are run here; what they read apart from each other's products is made by the workflow."""
-LEFT_OUT = (PointClass.EGO, PointClass.OUT_OF_RANGE)
 REAL = Path("../shared/data/kitti_raw_0005")
-TRUE, ESTIMATED = "truth", "estimated"
-RESTS_M_S, DRIVES_M_S, WAITS_SCANS = 0.1, 1.0, 30
 
 
 @dataclass(frozen=True)
@@ -111,6 +101,22 @@ class Scene:
         """Rows of a scan."""
         return slice(int(self.starts[index]), int(self.starts[index + 1]))
 
+    def first(self, chunks: int) -> Scene:
+        """The scene as far as so many chunks reach."""
+        scans = sum(len(Labels.open(Path(path))) for path in self.files[Labels.NAME][:chunks])
+        end = int(self.starts[scans])
+        columns = {name: getattr(self, name)[:end] for name in ("points", "labels", "true_class", "instance")}
+        split = {product.NAME for product in (Deskewed, Labels)}
+        return dataclasses.replace(
+            self,
+            **columns,
+            starts=self.starts[: scans + 1],
+            stamp_ns=self.stamp_ns[:scans],
+            poses={name: T[:scans] for name, T in self.poses.items()},
+            files={name: paths[:chunks] if name in split else paths for name, paths in self.files.items()},
+            inputs={name: f"{digest}-{scans}" for name, digest in self.inputs.items()},
+        )
+
     def placed(self, poses: str) -> NDArray[np.float32]:
         """All points (n, 3) in the map of these poses, m."""
         out = np.empty(self.points.shape, np.float32)
@@ -129,7 +135,7 @@ def of_session() -> tuple[type[Product], ...]:
 
 def made() -> tuple[type[Product], ...]:
     """What the workflow makes for a scene."""
-    return (Truth, Deskewed, Labels, *of_session())
+    return tuple(dict.fromkeys((Truth, Deskewed, Labels, Session, Odometry, *of_session())))
 
 
 def scene(place: Place, store: Path, kept: Path) -> Scene:
@@ -144,7 +150,7 @@ def scene(place: Place, store: Path, kept: Path) -> Scene:
     if not (folder / "scene.json").exists():
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        _gather(place, result, folder)
+        gather(place.drive.folder, result, made(), folder)
     return _opened(place, folder)
 
 
@@ -154,121 +160,6 @@ def _digest(result: Result) -> str:
         part.digest for _, artifact in result.artifacts for product in read for part in artifact.of(product)
     )
     return hashlib.sha256("".join(digests).encode()).hexdigest()[:16]
-
-
-def _gather(place: Place, result: Result, folder: Path) -> None:
-    """Write the arrays; the description comes last, so that a folder with one is whole."""
-    poses: Poses = result.parts(Poses)[0]
-    T = _near_origin(poses.T_world_lidar)
-    np.save(folder / f"T_{ESTIMATED}.npy", T)
-    np.save(folder / "stamp_ns.npy", poses.stamp_ns)
-    if TRUE in place.poses:
-        truth = result.parts(Truth)[0]
-        within = np.clip(poses.stamp_ns, truth.stamp_ns[0], truth.stamp_ns[-1])
-        true = interpolate_poses(truth.stamp_ns, truth.T_truth_lidar, within)
-        np.save(folder / f"T_{TRUE}.npy", _near_origin(true))
-        kinds = _simulated(result, folder)
-    else:
-        kinds = _measured(place, result, folder, T)
-    files = {p.NAME: [str(path) for _, path in result.files(p)] for p in (*made(), TruthLog)}
-    described = {"kinds": kinds, "files": files, "inputs": _inputs(place, folder)}
-    (folder / "scene.json").write_text(json.dumps(described, indent=1) + "\n")
-
-
-def _inputs(place: Place, folder: Path) -> dict[str, str]:
-    """Digest of points and poses by set of poses: what a system that knows nothing else depends on."""
-    common = hashlib.sha256()
-    for name in ("points", "starts"):
-        common.update(np.load(folder / f"{name}.npy").data)
-    digests = {}
-    for poses in place.poses:
-        digest = common.copy()
-        digest.update(np.load(folder / f"T_{poses}.npy").data)
-        digests[poses] = digest.hexdigest()[:16]
-    return digests
-
-
-def _near_origin(T: F8) -> F8:
-    """The same poses in a frame that starts where they do, so that float32 holds millimetres."""
-    moved = np.array(T, np.float64)
-    moved[:, :3, 3] -= np.floor(moved[0, :3, 3])
-    return moved
-
-
-Kinds = dict[str, list[int]]
-
-
-def _simulated(result: Result, folder: Path) -> Kinds:
-    """Points with the simulator's own truth; what its objects are."""
-    (log,) = (path for _, path in result.files(TruthLog))
-    true = iter(TruePoints.open(log / "points.parquet"))
-    _write(
-        folder,
-        ((scan, labels, _same(scan, next(true))) for scan, labels in scans_of(result)),
-    )
-    standing = TrueObjects.open(log / "objects.parquet")
-    moving = TrueTracks.open(log / "tracks.parquet")
-    kinds = _by_name(standing.what, standing.instance)
-    kinds |= {f"moving_{what}": numbers for what, numbers in _by_name(moving.what, moving.instance).items()}
-    return kinds | {"waiting_car": waiting_cars(moving)}
-
-
-def _by_name(what: NDArray[np.object_], instance: NDArray[np.uint16]) -> Kinds:
-    return {name: sorted({int(n) for n in instance[what == name]}) for name in sorted(set(what))}
-
-
-def waiting_cars(moving: TrueTracks) -> list[int]:
-    """Numbers of the cars that are seen to stand for three seconds and more, and to drive at another time."""
-    counts = (moving.what == "car") & (moving.class_ == PointClass.DYNAMIC) & (moving.points > 0)
-    rested = moving.instance[counts & (moving.speed_m_s < RESTS_M_S)]
-    drove = moving.instance[counts & (moving.speed_m_s > DRIVES_M_S)]
-    numbers, scans = np.unique(rested, return_counts=True)
-    return [int(n) for n in numbers[scans >= WAITS_SCANS] if n in drove]
-
-
-def _same(scan: DeskewedScan, true: TrueLabels) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
-    if len(scan) != len(true) or scan.scan_index != true.scan_index:
-        raise SystemExit(f"truth of scan {true.scan_index} is not that of scan {scan.scan_index}")
-    return true.class_, true.instance
-
-
-def _measured(place: Place, result: Result, folder: Path, T: F8) -> Kinds:
-    """Points with boxes as truth: what is in none is not judged."""
-    assert place.drive.folder is not None
-    tracks: list[BoxTrack] = read_boxes(place.drive.folder / LABELS, T)
-    rows = ((scan, labels, boxed(scan, tracks, UNJUDGED)) for scan, labels in scans_of(result))
-    _write(folder, rows)
-    kinds: Kinds = {}
-    for track in tracks:
-        kinds.setdefault(f"{'moving' if track.moving else 'parked'}_{track.what.lower()}", []).append(
-            track.number
-        )
-    return kinds
-
-
-def scans_of(result: Result) -> Iterator[tuple[DeskewedScan, ScanLabels]]:
-    """Scan by scan with the labels of denoise."""
-    for chunk, labels in zip(result.parts(Deskewed), result.parts(Labels)):
-        yield from zip(chunk, labels)
-
-
-Row = tuple[DeskewedScan, ScanLabels, tuple[NDArray[np.uint8], NDArray[np.uint16]]]
-
-
-def _write(folder: Path, rows: Iterator[Row]) -> None:
-    columns: dict[str, list[NDArray[Any]]] = {
-        name: [] for name in ("points", "labels", "true_class", "instance")
-    }
-    for scan, labels, (true_class, instance) in rows:
-        counts = ~np.isin(labels.class_, LEFT_OUT)
-        columns["points"].append(scan.points()[counts])
-        columns["labels"].append(labels.class_[counts])
-        columns["true_class"].append(true_class[counts])
-        columns["instance"].append(instance[counts])
-    sizes = [len(part) for part in columns["labels"]]
-    np.save(folder / "starts.npy", np.concatenate(([0], np.cumsum(sizes))).astype(np.int64))
-    for name, parts in columns.items():
-        np.save(folder / f"{name}.npy", np.concatenate(parts))
 
 
 def _opened(place: Place, folder: Path) -> Scene:

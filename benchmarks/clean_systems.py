@@ -57,7 +57,8 @@ def classify(
     system: System, variant: str, scene: Scene, poses: str, settings: Settings, fresh: bool
 ) -> Outcome:
     """Run a system, unless the same version has said before what it keeps of the scene; `fresh` runs it again."""
-    read = f"{scene.folder.name}-{poses}-{_short(settings)}" if system.ours else scene.inputs[poses]
+    more = f"{scene.folder.name}-{_short(settings)}-" if system.ours else ""
+    read = f"{more}{scene.inputs[poses]}"
     path = scene.folder.parent / "outcomes" / f"{system.name}-{variant}-{read}-{system.version()}.npz"
     path.parent.mkdir(exist_ok=True)
     if fresh or not path.exists():

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from benchmarks.clean_boxes import BoxTrack, boxed, in_box, moves
 from benchmarks.clean_nearness import near
-from benchmarks.clean_scenes import WAITS_SCANS, waiting_cars
+from benchmarks.clean_page import END, START, fill, tables
 from benchmarks.clean_scores import (
     UNJUDGED,
     Accuracy,
@@ -18,6 +20,8 @@ from benchmarks.clean_scores import (
     kept_in_map,
     may_stand,
 )
+from benchmarks.clean_truth import WAITS_SCANS, waiting_cars
+from benchmarks.scores import Figure
 from scanloom.schemas.scans import DeskewedScan, PointClass
 from scanloom.schemas.simulated import TrueTracks
 from scanloom.stages.geometry.se3 import F8, pose, so3_exp
@@ -185,3 +189,28 @@ def test_a_car_waits_when_it_is_seen_to_rest_and_to_drive() -> None:
         seen(6, [0.0] * n + [5.0], what=np.array(["bus"] * (n + 1), object)),
     ]
     assert waiting_cars(TrueTracks.concatenate(tracks)) == [1]
+
+
+FIGURES = [
+    Figure("bench.clean.town.scanloom.sa_percent", 98.456, "%", "town", ""),
+    Figure("bench.clean.town.scanloom.ms_per_scan", 40.0, "ms", "town", ""),
+    Figure("bench.clean.town.dufomap.da_percent", 90.0, "%", "town", ""),
+    Figure("bench.clean.town.scanloom.kind_car.sa_percent", 99.0, "%", "town", ""),
+    Figure("bench.clean.town.dufomap.kind_car.worst_sa_percent", 97.0, "%", "town", ""),
+]
+
+
+def test_tables_by_scene_and_by_kind() -> None:
+    lines = list(tables(FIGURES))
+    assert "| town | scanloom | 98.46 |  |  |  |  |  |  |  |  | 40 |" in lines
+    assert "| town | dufomap |  | 90.00 |  |  |  |  |  |  |  |  |" in lines
+    assert "| town | kind_car | 99.00 |  |  |  |  |  | 97.00 |  |" in lines
+
+
+def test_a_page_keeps_what_is_around_its_tables(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(f"above\n{START}\nold\n{END}\nbelow\n")
+    fill(page, FIGURES, "measured")
+    text = page.read_text()
+    assert text.startswith(f"above\n{START}\n") and text.endswith(f"{END}\nbelow\n")
+    assert "old" not in text and "measured" in text and "| town |" in text
