@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.stages.geometry.se3 import F8
-from scanloom.stages.simulate.grains import DUST_INSTANCE, SPRAY_INSTANCE, Grains, Gusts, Rows, first_met
+from scanloom.stages.simulate.grains import DUST_INSTANCE, SPRAY_INSTANCE, Grains
 from scanloom.stages.simulate.meshes import Material
 from scanloom.stages.simulate.motion import Motion
 from scanloom.stages.simulate.rig import MIN_RANGE_M
@@ -24,8 +24,17 @@ FRESH_M, MIXING_M2_S = 0.6, 0.5
 """A puff is so wide when it is raised (standard deviation), and spreads by turbulence: var = FRESH^2 + 2 MIXING age."""
 SETTLING_S = 6.0
 STEP_M = 1.8
-DUST_NEEDED, SPRAY_NEEDED = 3, 1
-"""Grains for a return: dust so dense that a beam holds many of them sends rays back from a surface."""
+SHAPE = 50.0
+DUST_LONE, SPRAY_LONE = 0.12, 0.6
+CUT = 2.6
+"""Standard deviations from its middle where a puff ends."""
+STEP_R_M, FAR_M = 0.3, 45.0
+RANGES_M = np.arange(STEP_R_M / 2, FAR_M, STEP_R_M)
+"""Middles of the cells over which the optical depth of a ray is summed."""
+THIN = 0.002
+WISP_M, WISP_CELLS, WISP_SPREAD = 0.4, 40, 0.8
+REACH_M = 60.0
+"""Spray farther away is not seen."""
 SPRAY_AGES_S = np.arange(0.1, 1.3, 0.15)
 SPRAY_SPEED_M_S = 8.0
 WHEELS_M = -1.6
@@ -63,61 +72,104 @@ class Burst:
 
 
 @dataclass(frozen=True)
+class Wisps:
+    """Texture of a cloud: density relative to its mean, in cells of a block that repeats and drifts with the wind."""
+
+    density: NDArray[np.float32]
+    wind_m_s: F8
+
+    @classmethod
+    def of(cls, rng: np.random.Generator, wind_m_s: F8) -> Wisps:
+        from scipy.ndimage import gaussian_filter
+
+        white = rng.standard_normal((WISP_CELLS,) * 3)
+        layers = [gaussian_filter(white, width, mode="wrap") for width in (1.2, 4.0)]
+        noise = sum(layer / layer.std() for layer in layers) / np.sqrt(2)
+        density = np.exp(WISP_SPREAD * noise)
+        return cls((density / density.mean()).astype(np.float32), wind_m_s)
+
+    def __call__(self, p: F8, t: float) -> NDArray[np.float32]:
+        """Relative density (...) at places p (..., 3)."""
+        x, y, z = np.moveaxis(((p - self.wind_m_s * t) / WISP_M).astype(np.int64) % WISP_CELLS, -1, 0)
+        out: NDArray[np.float32] = self.density[x, y, z]
+        return out
+
+
+@dataclass(frozen=True)
 class Plumes:
-    """Soft clouds over time, with a texture of wisps."""
+    """Soft clouds over time.
+
+    A ray comes back from where its optical depth reaches a threshold with mean 1. Where a beam holds many grains the
+    threshold hardly varies (Gamma with a large shape), and neighbouring rays see a surface; a share of rays, `lone`, is
+    sent back by a single large grain (exponential), also from the thin fringe of a cloud.
+    """
 
     seed: tuple[int, int]
     puffs: Callable[[float], list[Puff]]
-    texture: Gusts
-    needed: int
+    wisps: Wisps
+    lone: float
     strength: float
     """Median share of the light that comes back from it."""
     material: Material
     instance: int
 
     def met(self, index: int, t: float, origin: F8, direction: F8, reach_m: NDArray[np.float32]) -> Grains:
-        """As `Air` has it. Of several puffs on a ray the first that sends it back hides the rest."""
+        """As `Air` has it."""
         rng = np.random.default_rng((*self.seed, index))
-        reach = reach_m.astype(np.float32).copy()
-        hit = np.zeros(len(reach), bool)
-        for puff in self.puffs(t):
-            rows, range_m = self._through(rng, puff, t, origin, direction, reach)
-            reach[rows], hit[rows] = range_m, True
-        rows = np.flatnonzero(hit)
-        strength = self.strength * np.exp(0.5 * rng.standard_normal(len(rows)))
-        return Grains(rows, reach[rows].astype(float), strength, self.material, self.instance)
+        n = len(reach_m)
+        lone = rng.random(n) < self.lone
+        enough = np.where(lone, rng.exponential(1.0, n), rng.gamma(SHAPE, 1 / SHAPE, n))
+        strength = self.strength * np.exp(0.5 * rng.standard_normal(n))
+        rows, depth = self._depth(t, origin, direction)
+        ends = depth[:, -1] >= enough[rows]
+        rows, depth = rows[ends], depth[ends]
+        cell = (depth < enough[rows, None]).sum(axis=1)
+        before = np.where(cell > 0, depth[np.arange(len(rows)), cell - 1], 0.0)
+        within = (enough[rows] - before) / (depth[np.arange(len(rows)), cell] - before)
+        range_m = STEP_R_M * (cell + within)
+        free = (range_m < reach_m[rows]) & (range_m > MIN_RANGE_M)
+        return Grains(rows[free], range_m[free], strength[rows[free]], self.material, self.instance)
 
-    def _through(
-        self,
-        rng: np.random.Generator,
-        puff: Puff,
-        t: float,
-        origin: F8,
-        direction: F8,
-        reach: NDArray[np.float32],
-    ) -> tuple[Rows, F8]:
-        """Rays through one puff, whose extinction along a ray is a Gaussian about the nearest point."""
-        from scipy.special import ndtr, ndtri
+    def _depth(self, t: float, origin: F8, direction: F8) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Rays (m,) that come near a puff, and their optical depth (m, RANGES_M) as far as each of RANGES_M."""
+        near = [(puff, _towards(puff, origin, direction)) for puff in self.puffs(t)]
+        touched = np.zeros(len(origin), bool)
+        for _, towards in near:
+            touched[towards] = True
+        rows = np.flatnonzero(touched)
+        density = np.zeros((len(rows), len(RANGES_M)), np.float32)
+        for puff, towards in near:
+            _add(density, np.searchsorted(rows, towards), puff, origin[towards], direction[towards])
+        ray, cell = np.nonzero(density > THIN)
+        place = origin[rows[ray]] + direction[rows[ray]] * RANGES_M[cell, None]
+        density[ray, cell] *= self.wisps(place, t)
+        return rows, np.cumsum(density * np.float32(STEP_R_M), axis=1)
 
-        scaled, heading = (puff.centre - origin) / puff.sigma_m, direction / puff.sigma_m
-        steep = np.linalg.norm(heading, axis=1)
-        middle = np.einsum("ni,ni->n", scaled, heading) / steep**2
-        off2 = np.einsum("ni,ni->n", scaled, scaled) - (middle * steep) ** 2
-        near = (off2 < 9.0) & (middle + 3 / steep > MIN_RANGE_M) & (middle - 3 / steep < reach)
-        most = self.needed * puff.extinction * Gusts.MOST
-        whole = most * np.exp(-off2 / 2) * np.sqrt(2 * np.pi) / steep
-        start = ndtr((MIN_RANGE_M - middle) * steep)
 
-        def range_at(depth: F8, rays: Rows) -> F8:
-            share = start[rays] + depth / whole[rays]
-            far = middle[rays] + ndtri(np.minimum(share, 1.0)) / steep[rays]
-            out: F8 = np.where(share < 1, far, np.inf)
-            return out
+def _add(density: NDArray[np.float32], at: NDArray[np.int64], puff: Puff, origin: F8, direction: F8) -> None:
+    """Add the extinction of a puff in the middles of the cells of rays: a Gaussian about each ray's nearest point."""
+    scaled, heading = (puff.centre - origin) / puff.sigma_m, direction / puff.sigma_m
+    steep2 = np.einsum("ni,ni->n", heading, heading)
+    middle = np.einsum("ni,ni->n", scaled, heading) / steep2
+    off2 = np.einsum("ni,ni->n", scaled, scaled) - middle**2 * steep2
+    half = np.sqrt(np.maximum(CUT**2 - off2, 0.0) / steep2)
+    through = np.flatnonzero((half > 0) & (middle + half > 0))
+    if len(through) == 0:
+        return
+    first, last = np.searchsorted(RANGES_M, [(middle - half)[through].min(), (middle + half)[through].max()])
+    off = (RANGES_M[first:last] - middle[through, None]).astype(np.float32)
+    fall = off2[through, None].astype(np.float32) + off**2 * steep2[through, None].astype(np.float32)
+    density[at[through], first:last] += np.float32(puff.extinction) * np.exp(np.float32(-0.5) * fall)
 
-        def chance_at(range_m: F8, rays: Rows) -> F8:
-            return self.texture(origin[rays] + direction[rays] * range_m[:, None], t) / Gusts.MOST
 
-        return first_met(rng, np.flatnonzero(near), reach, range_at, chance_at, self.needed)
+def _towards(puff: Puff, origin: F8, direction: F8) -> NDArray[np.int64]:
+    """Rays that may meet a puff: those into the cone about a ball round it, with room for the way the sensor moves."""
+    there = puff.centre - origin[len(origin) // 2]
+    radius = CUT * float(puff.sigma_m.max()) + 1.5
+    far2 = float(there @ there)
+    if far2 <= radius**2:
+        return np.arange(len(origin))
+    return np.flatnonzero(direction @ there > np.sqrt(far2 - radius**2))
 
 
 def dust_clouds(settings: Settings, path: Path, motion: Motion) -> Plumes:
@@ -134,8 +186,8 @@ def dust_clouds(settings: Settings, path: Path, motion: Motion) -> Plumes:
     return Plumes(
         (settings.seed, 25),
         lambda t: [puff for burst in bursts for puff in burst.puffs(t)],
-        Gusts.of(rng, wind, (0.7, 4.0), 0.7, 8),
-        DUST_NEEDED,
+        Wisps.of(rng, wind),
+        DUST_LONE,
         0.05,
         Material.DUST,
         DUST_INSTANCE,
@@ -164,17 +216,18 @@ def spray(settings: Settings, path: Path, motion: Motion, movers: Sequence[Mover
 
     def puffs(t: float) -> list[Puff]:
         times = t - SPRAY_AGES_S
-        tracks = [mover.poses(path, times) for mover in wet]
-        behind = [-mover.mesh.vertices[:, 0].max() for mover in wet]
-        tracks.append(motion.poses(times))
-        behind.append(-0.6)
-        return [puff for T, x in zip(tracks, behind, strict=True) for puff in _wake(settings, T, x)]
+        here = motion.poses(times)
+        found = _wake(settings, here, -0.6)
+        for mover in wet:
+            if np.linalg.norm(mover.poses(path, times[:1])[0, :3, 3] - here[0, :3, 3]) < REACH_M:
+                found += _wake(settings, mover.poses(path, times), -float(mover.mesh.vertices[:, 0].max()))
+        return found
 
     return Plumes(
         (settings.seed, 27),
         puffs,
-        Gusts.of(rng, np.array([1.0, 0.5, 0.0]), (0.5, 2.5), 0.9, 8),
-        SPRAY_NEEDED,
+        Wisps.of(rng, np.array([1.0, 0.5, 0.0])),
+        SPRAY_LONE,
         0.035,
         Material.WATER,
         SPRAY_INSTANCE,

@@ -62,7 +62,8 @@ class Settings(BaseModel):
         0.0,
         ge=0.0,
         le=0.5,
-        description="snowfall: chance of a return from a flake in a metre of ray, at the range where flakes are seen best, 1/m; 0.0006 is light (0.5 % of the returns in streets, 1 % in the open), 0.0035 middle (3 and 6 %), 0.012 heavy "
+        description="snowfall: chance of a return from a flake in a metre of ray, at the range where flakes are seen best, "
+        "1/m; 0.0006 is light (0.5 % of the returns in streets, 1 % in the open), 0.0035 middle (3 and 6 %), 0.012 heavy "
         "(9 and 19 %)",
     )
     dust_clouds: float = Field(
@@ -70,11 +71,14 @@ class Settings(BaseModel):
         ge=0.0,
         le=20.0,
         description="clouds of dust that wind and wheels raise near the vehicle, on streets and field, and that drift: "
-        "extinction of fresh dust, 1/m; 0.4 is light (1 to 2 % of the returns), 0.8 middle (about 6 %), 2 heavy (10 to 30 %; "
+        "extinction of fresh dust, 1/m; 0.2 is light (about 3 % of the returns), 0.5 middle (10 %), 1.5 heavy (24 %; "
         "some scans see little else)",
     )
     spray_per_m: float = Field(
-        0.0, ge=0.0, le=5.0, description="spray behind wheels on a wet road: extinction at 8 m/s, 1/m"
+        0.0,
+        ge=0.0,
+        le=5.0,
+        description="spray behind wheels on a wet road: extinction at 8 m/s, 1/m; 0.3 is light, 1 middle, 3 heavy",
     )
 
     beams: Literal[16, 32, 64] = Field(32, description="beams of the LiDAR")
