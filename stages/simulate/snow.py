@@ -27,6 +27,7 @@ OVERLAP_M = 1.5
 """Nearer than this, what comes back partly misses the receiver."""
 EDGES_M = np.concatenate((np.arange(MIN_RANGE_M, 12, 0.1), np.arange(12, 45, 0.5)))
 WIND_M_S = np.array([2.1, -1.2, -1.1])
+TUNNEL_WIDE_M = 7.0
 CLUMPS, CLUMP_RANGE_M, CLUMP_M = 0.1, 12.0, 0.03
 """Share of flakes that neighbouring beams meet, too, as far as this range, with this spread in range, m."""
 NEIGHBOURS = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
@@ -42,13 +43,15 @@ class Snow:
     beams: int
     gusts: Gusts
     slow: Gusts
+    tunnel_x: tuple[float, float]
+    """No snow falls between, m east, in the road along y = 0."""
     depth: F8
     """Optical depth at EDGES_M for a `per_m` of 1."""
     sizes: F8
     """(edges, sizes) cumulative shares of the sizes of the flakes that are seen at a range."""
 
     @classmethod
-    def of(cls, seed: int, per_m: float, beams: int) -> Snow:
+    def of(cls, seed: int, per_m: float, beams: int, tunnel_x: tuple[float, float] = (0.0, 0.0)) -> Snow:
         rng = np.random.default_rng((seed, 23))
         seen = _seen()
         rate = seen.sum(axis=1) * _width(EDGES_M) ** 2 * (1 - np.exp(-((EDGES_M / OVERLAP_M) ** 2)))
@@ -61,6 +64,7 @@ class Snow:
             beams,
             Gusts.of(rng, WIND_M_S, (3.0, 15.0), 0.6),
             Gusts.of(rng, 2 * WIND_M_S, (40.0, 120.0), 0.35, 4),
+            tunnel_x,
             depth,
             sizes / sizes[:, -1:],
         )
@@ -76,11 +80,18 @@ class Snow:
             np.arange(len(origin)),
             reach_m,
             lambda depth, _: np.interp(depth / most, self.depth, EDGES_M, right=np.inf),
-            lambda r, rays: self.gusts(origin[rays] + direction[rays] * r[:, None], t) / Gusts.MOST,
+            lambda r, rays: self._chance(origin[rays] + direction[rays] * r[:, None], t),
         )
         strength = self._strength(rng, range_m)
         rows, range_m, strength = self._clumped(rng, len(origin), rows, range_m, strength)
         return Grains(rows, range_m, strength, Material.SNOW, SNOW_INSTANCE)
+
+    def _chance(self, p: F8, t: float) -> F8:
+        inside = (
+            (p[:, 0] > self.tunnel_x[0]) & (p[:, 0] < self.tunnel_x[1]) & (np.abs(p[:, 1]) < TUNNEL_WIDE_M)
+        )
+        out: F8 = np.where(inside, 0.0, self.gusts(p, t) / Gusts.MOST)
+        return out
 
     def _strength(self, rng: np.random.Generator, range_m: F8) -> F8:
         """Of flakes that are seen, (n,)."""

@@ -25,7 +25,7 @@ from scanloom.stages.simulate.traffic import CONVOY, build_traffic
 
 LONG = Settings(busy=True)
 SHORT = Settings(
-    busy=True, beams=16, columns=128, start_m=20.0, duration_s=16.0, standstill_s=0.5, dust_per_m=0.0
+    busy=True, beams=16, columns=64, start_m=20.0, duration_s=16.0, standstill_s=0.5, dust_per_m=0.0
 )
 
 
@@ -107,7 +107,7 @@ def test_the_cast_is_complete() -> None:
     [
         LONG,
         Settings(busy=True, seed=2, start_m=430.0, duration_s=60.0),
-        Settings(busy=True, route="estate", duration_s=60.0),
+        Settings(busy=True, route="estate", duration_s=40.0),
     ],
 )
 def test_nobody_is_in_anybodys_way(settings: Settings) -> None:

@@ -19,7 +19,9 @@ from scanloom.stages.simulate.motion import build_motion
 from scanloom.stages.simulate.plumes import LIFE_S, Burst
 from scanloom.stages.simulate.rig import MIN_RANGE_M, T_BASE
 from scanloom.stages.simulate.settings import Settings
+from scanloom.stages.simulate.snow import Snow
 from scanloom.stages.simulate.sweeping import Lidar, Sweep
+from scanloom.stages.simulate.terrain import Plan
 from scanloom.stages.simulate.town import Town, build_town
 from scanloom.stages.simulate.traffic import build_traffic
 from scanloom.stages.simulate.weather import build_weather
@@ -80,6 +82,21 @@ def test_snow_is_near_and_weak_with_a_tail() -> None:
     # A threshold on the intensity alone loses road or keeps snow.
     assert 0.03 < (intensity > np.median(ground)).mean() < 0.3
     assert np.percentile(intensity, 99) > 10
+
+
+def test_no_snow_falls_in_the_tunnel() -> None:
+    low, high = Plan().tunnel
+    snow = Snow.of(0, HEAVY, 16, Plan().tunnel)
+    rng = np.random.default_rng(0)
+    direction = rng.standard_normal((16 * 512, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    reach = np.full(len(direction), 4.0, np.float32)
+    counts = []
+    for x in (low - 8.0, (low + high) / 2, high + 8.0):
+        origin = np.tile([x, 0.0, 2.0], (len(direction), 1))
+        counts.append(len(snow.met(0, 1.0, origin, direction, reach).rows))
+    assert counts[1] == 0
+    assert min(counts[0], counts[2]) > 20
 
 
 def test_flakes_are_others_in_every_sweep_and_dust_stays() -> None:
