@@ -63,8 +63,8 @@ NODES: tuple[Node, ...] = (
     node("changes",    changes,    per="map",     reads=(Base, Poses, Deskewed, FinalLabels, Piece), writes=(Changes, ChangeFiles)),
     node("tiles",      tiles,      per="tile",    reads=(Piece,),                              writes=(Tile, RemovedTile, TileFiles)),
     node("overview",   overview,   per="map",     reads=(Tile, RemovedTile),                   writes=(TileIndex, MapFiles)),
-    node("evaluation", evaluation, per="map",     reads=(Session, Truth, Odometry, Poses, Loops, Graph, Gnss, Tile, SensorCheck), writes=(Metrics, ErrorTrack)),
-    node("picture",    picture,    per="map",     reads=(Poses, Loops, Graph, TileIndex, Tile), writes=PictureFiles),
+    node("evaluation", evaluation, per="map",     reads=(Session, Truth, Odometry, Poses, Loops, Graph, Gnss, Tile, SensorCheck, ClassCounts, RemovedTile), writes=(Metrics, ErrorTrack)),
+    node("picture",    picture,    per="map",     reads=(Poses, Loops, Graph, TileIndex, Tile, RemovedTile), writes=PictureFiles),
     node("report",     report,     per="map",     reads=(Session, Metrics, ErrorTrack, Odometry, Poses, Loops, Graph, TileIndex, PictureFiles, SensorCheck, Changes), writes=ReportFiles),
 )
 # fmt: on

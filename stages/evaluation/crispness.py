@@ -8,13 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.schemas.product import Parts
-from scanloom.schemas.tiles import Tile
+from scanloom.schemas.tiles import RemovedTile, Tile
 from scanloom.stages.evaluation.figures import Figure
+from scanloom.stages.evaluation.removed import crispness_figures
 from scanloom.stages.geometry.entropy import mean_entropy, point_entropies
 
 
 def map_figures(
-    tiles: Parts[Tile], radii_m: tuple[float, ...], min_neighbours: int, samples: int, seed: int
+    tiles: Parts[Tile],
+    radii_m: tuple[float, ...],
+    min_neighbours: int,
+    samples: int,
+    seed: int,
+    removed: Parts[RemovedTile] | None = None,
 ) -> Iterator[Figure]:
     """Extent of the map and mean map entropy at a seeded sample of its points; tiles are read one by one."""
     counts = [len(tile) for tile in tiles]
@@ -44,6 +50,8 @@ def map_figures(
             "share of the sampled points with enough neighbours",
             "map",
         )
+    if removed is not None and any(map(len, removed)):
+        yield from crispness_figures(tiles, removed, queries, radii_m[len(radii_m) // 2], min_neighbours)
 
 
 def _spread(counts: list[int], samples: int, seed: int) -> list[NDArray[np.int64]]:

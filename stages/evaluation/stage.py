@@ -16,7 +16,8 @@ Truth is used here alone, and only where there is some:
   that the graph uses; `gnss.used_error_*`: what the fixes in use are truly off by.
 
 Without truth: `odometry.degenerate_*`, where a direction was not seen beyond noise; `gnss.*`, what became of the fixes by
-the receiver's own status and how far they lie from the antenna of the finished map; `sensors.*`; `map.*`, mean map entropy.
+the receiver's own status and how far they lie from the antenna of the finished map; `sensors.*`; `map.*`, mean map entropy;
+`clean.*`, how many points were left out of the map and why, and the entropy at the same points with them and without.
 """
 
 from __future__ import annotations
@@ -26,13 +27,14 @@ from dataclasses import dataclass
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from scanloom.schemas.clean import ClassCounts
 from scanloom.schemas.evaluation import ErrorTrack, Metrics
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.product import Part, Parts, ProductT
 from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.session import Session
-from scanloom.schemas.tiles import Tile
+from scanloom.schemas.tiles import RemovedTile, Tile
 from scanloom.schemas.tracks import Gnss
 from scanloom.schemas.trajectory import Odometry, Poses, Truth
 from scanloom.stages.evaluation.crispness import map_figures
@@ -41,6 +43,7 @@ from scanloom.stages.evaluation.figures import Figure, to_metrics
 from scanloom.stages.evaluation.fixes import fix_figures, true_fix_figures
 from scanloom.stages.evaluation.loops import judged, loop_figures
 from scanloom.stages.evaluation.paths import TruePath, true_paths
+from scanloom.stages.evaluation.removed import count_figures
 from scanloom.stages.evaluation.revisits import revisits
 from scanloom.stages.evaluation.search import search_figures
 from scanloom.stages.evaluation.sensors import sensor_figures
@@ -83,6 +86,8 @@ def evaluation(
     gnss: Parts[Gnss],
     tiles: Parts[Tile],
     check: Parts[SensorCheck] | None = None,
+    counts: Parts[ClassCounts] | None = None,
+    removed: Parts[RemovedTile] | None = None,
 ) -> Iterator[Part[ErrorTrack] | Metrics]:
     """Yield the error track of every session with truth, then the metrics of all sessions and of the map.
 
@@ -93,9 +98,11 @@ def evaluation(
     )
     truths = {name: t for name, t in given.truths.items() if len(t)}
     fixes = fix_rows(graph)
+    by_name = {} if counts is None else counts.by("session")
     figures: list[Figure] = []
     for name in sorted(given.odometries.keys() & given.poses.keys()):
         figures += _of(name, _session_figures(name, given, fixes))
+        figures += _of(name, count_figures(by_name.get(name, ())))
         if name in truths:
             track = error_track(truths[name], given.odometries[name], given.poses[name])
             if track is not None:
@@ -105,7 +112,12 @@ def evaluation(
     figures += session_figures(paths, given.poses)
     figures.append(_georeferenced(given.poses))
     figures += map_figures(
-        tiles, settings.entropy_radii_m, settings.entropy_neighbours, settings.entropy_samples, settings.seed
+        tiles,
+        settings.entropy_radii_m,
+        settings.entropy_neighbours,
+        settings.entropy_samples,
+        settings.seed,
+        removed,
     )
     yield to_metrics(figures)
 

@@ -13,15 +13,16 @@ from scanloom.schemas.evaluation import PictureFiles
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.product import Parts
-from scanloom.schemas.tiles import Tile, TileIndex
+from scanloom.schemas.tiles import RemovedTile, Tile, TileIndex
 from scanloom.schemas.trajectory import Poses
+from scanloom.stages.report.left_out import left_out
 from scanloom.stages.report.marks import map_marks
 from scanloom.stages.report.overlay import Mark, paint, scale_bar, to_svg
 from scanloom.stages.report.raster import View, draw_map, fit_view
 
 VERSION = 1
 
-PREVIEW, PLAIN, OVERLAY = "preview.png", "plain.jpg", "overlay.svg"
+PREVIEW, PLAIN, OVERLAY, LEFT_OUT = "preview.png", "plain.jpg", "overlay.svg", "left_out.png"
 
 
 class Settings(BaseModel):
@@ -42,8 +43,9 @@ def picture(
     graph: Graph,
     tile_index: TileIndex,
     tiles: Parts[Tile],
+    removed: Parts[RemovedTile] | None = None,
 ) -> PictureFiles:
-    """Draw the map, tile by tile, and what lies on it."""
+    """Draw the map, tile by tile, what lies on it, and on a sheet of its own what was left out of it."""
     paths = {c["session"]: p for c, p in poses.items()}
     view = _view(settings, paths, tile_index)
     plain, view = _enlarge(draw_map(tiles, view), view, settings.longest_px)
@@ -53,6 +55,7 @@ def picture(
             PREVIEW: _encoded(paint(plain, marks), "PNG", compress_level=3),
             PLAIN: _encoded(Image.fromarray(plain), "JPEG", quality=88),
             OVERLAY: to_svg(marks, view).encode(),
+            LEFT_OUT: _encoded(left_out(removed or (), view), "PNG", optimize=1, transparency=0),
         }
     )
 

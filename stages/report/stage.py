@@ -1,6 +1,6 @@
 """Report: the parts of `report.html` that do not vary from run to run.
 
-A verdict with every check behind it; the map from above; errors along the way; the loop graph with what was refused and
+A verdict with every check behind it; the map from above, with what was left out of it to be shown or hidden; errors along the way; the loop graph with what was refused and
 why; GNSS residuals by verdict; where odometry was blind, and in which direction; the pose graph kind by kind; for an
 extended map what is no longer there; all figures; the input and what is odd about it; the tiles.
 """
@@ -26,8 +26,9 @@ from scanloom.stages.report.along import blind_sessions, error_chart, fix_track
 from scanloom.stages.report.changed import changed
 from scanloom.stages.report.factor_table import factor_rows
 from scanloom.stages.report.figures import Figures
+from scanloom.stages.report.left_out import out_rows
 from scanloom.stages.report.loop_graph import loop_graph
-from scanloom.stages.report.map_picture import OVERLAY, PLAIN
+from scanloom.stages.report.map_picture import LEFT_OUT, OVERLAY, PLAIN
 from scanloom.stages.report.tables import headline_cards, metric_tables, tile_rows
 from scanloom.stages.report.templates import render
 from scanloom.stages.report.verdict import Limits, judge
@@ -84,7 +85,9 @@ def report(
         "body.html",
         verdict=judge(_limits(settings), sessions, figures, _gnss_medians(paths, fixes), graph),
         cards=headline_cards(sessions, figures),
-        picture=_data_uri(picture.read(PLAIN)),
+        picture=_data_uri(picture.read(PLAIN), "jpeg"),
+        left_out=_data_uri(picture.read(LEFT_OUT), "png"),
+        out_rows=out_rows(list(sessions), figures),
         overlay=picture.read(OVERLAY).decode(),
         names=list(paths),
         has_fixes=tile_index.georeference is not None and any(len(rows) for rows in fixes.values()),
@@ -126,5 +129,5 @@ def _limits(settings: Settings) -> Limits:
     )  # fmt: skip
 
 
-def _data_uri(jpeg: bytes) -> str:
-    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
+def _data_uri(image: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64," + base64.b64encode(image).decode()
