@@ -14,6 +14,8 @@ I4 = NDArray[np.int32]
 
 GATE_M = 0.4
 MOST_GATE_M = 0.8
+SMALLER = 0.001
+"""Inside several boxes the smallest wins; its area, m2, counts so little that outside the nearest does."""
 CELL_M = 0.25
 NOBODY, SEVERAL = -1, -2
 OWN_SHARE = 0.4
@@ -24,7 +26,7 @@ GROWS_M = 2.0
 
 @kernel
 def in_tracks(band: F4, state: F8, origin: F8, far: float) -> I4:
-    """Track (n,) in whose box, widened by a gate, each point lies; NOBODY in none. The box with the nearest side wins."""
+    """Track (n,) in whose box, widened by a gate, each point lies; NOBODY in none. The nearest box wins."""
     side = 2 * int(np.ceil(far / CELL_M)) + 1
     raster = np.full((side, side), NOBODY, np.int32)
     nearest = np.full((side, side), np.inf, np.float32)
@@ -52,8 +54,9 @@ def _paint(raster: I4, nearest: F4, m: int, row: F8, origin: F8) -> None:
             dx, dy = (a - side // 2 + 0.5) * CELL_M - x, (b - side // 2 + 0.5) * CELL_M - y
             u, v = abs(c * dx + s * dy) - 0.5 * row[LENGTH], abs(c * dy - s * dx) - 0.5 * row[WIDTH]
             off = max(u, v)
-            if off < gate and off < nearest[a, b]:
-                nearest[a, b] = off
+            rank = max(off, 0.0) + SMALLER * row[LENGTH] * row[WIDTH]
+            if off < gate and rank < nearest[a, b]:
+                nearest[a, b] = rank
                 raster[a, b] = m
 
 

@@ -22,6 +22,7 @@ I4 = NDArray[np.int32]
 SAMPLES = 40
 OUTSIDE_M = 0.3
 """A point this far out of the other box is asked."""
+GROWTH_M = 0.1
 
 
 @dataclass(frozen=True)
@@ -62,11 +63,8 @@ def sampled(band: F4, starts: I4, order: I4, origin: F8) -> tuple[I4, F8]:
 def asked(points: F8, box: F8, origin: F8, starts: I4, returns: F4) -> tuple[int, int]:
     """How many of a track's points (k, 3) that lie outside a box a scan saw through, and where it saw something."""
     through, taken = 0, 0
-    c, s = np.cos(box[2]), np.sin(box[2])
     for n in range(len(points)):
-        dx, dy = points[n, 0] - box[0], points[n, 1] - box[1]
-        u, v = abs(c * dx + s * dy) - 0.5 * box[3], abs(c * dy - s * dx) - 0.5 * box[4]
-        if max(u, v) < OUTSIDE_M:
+        if _outside(points[n, 0], points[n, 1], box[0], box[1], box[2], box[3], box[4]) < OUTSIDE_M:
             continue
         said = said_of(
             points[n, 0] - origin[0], points[n, 1] - origin[1], points[n, 2] - origin[2], starts, returns
@@ -74,3 +72,45 @@ def asked(points: F8, box: F8, origin: F8, starts: I4, returns: F4) -> tuple[int
         through += said > 0
         taken += said < 0
     return through, taken
+
+
+@kernel
+def without_background(
+    owner: I4, band: F4, origin: F8, state: F8, row_then: I4, boxes_then: F8, origin_then: F8, starts: I4, returns: F4
+) -> None:  # fmt: skip
+    """Take from the tracks, in place, the points by which they would grow into what stood there before.
+
+    Those are outside the box of their track, now and in an earlier scan, and something was there then. `row_then` (m,) is
+    the row of each track in that scan, -1 where it was not seen.
+    """
+    for n in range(len(owner)):
+        m = owner[n]
+        if m < 0 or row_then[m] < 0:
+            continue
+        x, y, z = band[n, 0] + origin[0], band[n, 1] + origin[1], band[n, 2] + origin[2]
+        if _outside(x, y, state[m, 0], state[m, 1], state[m, 20], state[m, 22], state[m, 23]) < GROWTH_M:
+            continue
+        box = boxes_then[row_then[m]]
+        if _outside(x, y, box[0], box[1], box[2], box[3], box[4]) < GROWTH_M:
+            continue
+        if said_of(x - origin_then[0], y - origin_then[1], z - origin_then[2], starts, returns) < 0:
+            owner[n] = -1
+
+
+@kernel
+def _outside(x: float, y: float, cx: float, cy: float, yaw: float, length: float, width: float) -> float:
+    """How far a place is outside a box, m; negative inside."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    u, v = c * (x - cx) + s * (y - cy), c * (y - cy) - s * (x - cx)
+    return float(max(abs(u) - 0.5 * length, abs(v) - 0.5 * width))
+
+
+@kernel
+def arrived(band: F4, asked: NDArray[np.bool_], origin: F8, origin_then: F8, starts: I4, returns: F4) -> NDArray[np.bool_]:  # fmt: skip
+    """Which of the asked points (n,) are at places that an earlier scan saw through."""
+    out = np.zeros(len(band), np.bool_)
+    for n in range(len(band)):
+        if asked[n]:
+            x, y, z = band[n, 0] + origin[0], band[n, 1] + origin[1], band[n, 2] + origin[2]
+            out[n] = said_of(x - origin_then[0], y - origin_then[1], z - origin_then[2], starts, returns) > 0
+    return out

@@ -29,6 +29,8 @@ LEAST_THROUGH = 3
 UPRIGHT_M = 0.4
 """Things stand upright: rings of the sensor on the ground, which run along with the vehicle, do not."""
 SIZE_QUANTILE = 0.7
+STEADY_ROWS = 10
+"""Places are averaged over so many scans before it is asked how far they are apart: what wanders about does not move."""
 TOP_MARGIN_M = 0.1
 PERSON_M, CYCLIST_M, CYCLIST_WIDTH_M, TRUCK_M = 1.1, 2.4, 1.2, 6.5
 PERSON_M_S = 3.0
@@ -169,9 +171,12 @@ def _step(dt: float, q: float) -> tuple[F8, F8]:
 
 def _moved(settings: Settings, path: F8, variance: F8) -> bool:
     """Whether the path leads farther than its uncertainty explains."""
-    low, high = path[:, :2].min(axis=0), path[:, :2].max(axis=0)
+    window = min(STEADY_ROWS, max(len(path) // 3, 1))
+    weight = np.full(window, 1.0 / window)
+    steady = np.column_stack([np.convolve(path[:, k], weight, mode="valid") for k in range(2)])
+    way = steady.max(axis=0) - steady.min(axis=0)
     sigma = float(np.sqrt(np.median(variance[:, :2].max(axis=1))))
-    return float(np.hypot(*(high - low))) > max(settings.min_displacement_m, settings.min_sigmas * sigma)
+    return float(np.hypot(*way)) > max(settings.min_displacement_m, settings.min_sigmas * sigma)
 
 
 def _yaw(seen: F8, place: NDArray[np.int64], path: F8, speed: F8, size: F8) -> F8:

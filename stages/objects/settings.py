@@ -31,12 +31,12 @@ class Settings(BaseModel):
     )
     min_scans: int = Field(3, ge=2, le=50, description="nor what was seen in fewer scans, number")
     min_score: float = Field(
-        0.8,
+        0.7,
         ge=0.0,
         le=1.0,
         description="share of the places it left, or came to, that were seen to be empty, number",
     )
     parked_s: float = Field(
-        3.0, ge=0.0, le=100.0, description="what stands so long to the end of its track has parked, s"
+        10.0, ge=0.0, le=100.0, description="what stands so long to the end of its track has parked, s"
     )
     lost_s: float = Field(0.6, ge=0.0, le=10.0, description="a track that is not seen for longer ends, s")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import deque
 from dataclasses import dataclass, field
 
@@ -13,7 +14,7 @@ from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.objects import filter as kalman
 from scanloom.stages.objects.association import NOBODY, in_tracks, spread_over_clusters
 from scanloom.stages.objects.clusters import clusters, extents, grouped
-from scanloom.stages.objects.evidence import Reference, asked, sampled
+from scanloom.stages.objects.evidence import Reference, arrived, asked, sampled, without_background
 from scanloom.stages.objects.settings import Settings
 from scanloom.stages.objects.virtual_scan import VirtualScan
 
@@ -30,6 +31,13 @@ LOST_REACH_M = 0.6
 SAME_SIZE = 2.0
 LEAST_TRACK_POINTS = 3
 LOWEST_TOP_M = 0.5
+SEED_EVERY = 3
+"""Every third scan is searched for what arrived beside something larger."""
+SEED_AGE_S = 0.5
+SEED_RANGE_M = 30.0
+SEED_POINTS = 8
+SEED_M_S, SEED_WITHIN_M2 = 0.7, 4.0
+"""What arrived in the box of something that moves, or that is no larger, is not something new."""
 
 
 @dataclass
@@ -61,13 +69,16 @@ class Tracker:
             kalman.predict(self._state, (stamp_ns - self._last_ns) * 1e-9)
         self._last_ns = stamp_ns
         owner, label, count = self._owners(scan)
+        self._hold_to_size(scan, stamp_ns, owner)
         starts, order = grouped(owner, len(self._state))
         seen = update_all(scan.band, starts, order, self._state, scan.origin, scan.ground, scan.starts, scan.returns, step_rad)  # fmt: skip
         self._remember(seen, scan_index)
         self._ask(scan, stamp_ns, seen, starts, order)
         self._keep_reference(scan, stamp_ns, starts, order)
-        self._merge()
         self._begin(scan, owner, label, count, scan_index, step_rad)
+        if scan_index % SEED_EVERY == 0:
+            self._begin_within(scan, stamp_ns, owner, scan_index, step_rad)
+        self._merge()
         return self._ended()
 
     def finish(self) -> list[History]:
@@ -153,16 +164,60 @@ class Tracker:
         wanted = (
             (shape[:, 0] >= s.min_points) & (broad <= s.longest_m) & (shape[:, 5] >= LOWEST_TOP_M) & ~partly
         )
-        starts, order = grouped(free, count)
+        self._start(scan, free, count, wanted, scan_index, step_rad)
+
+    def _begin_within(
+        self, scan: VirtualScan, stamp_ns: int, owner: I4, scan_index: int, step_rad: float
+    ) -> None:
+        """New tracks from what arrived beside something larger, a wall or a hedge, since an earlier scan."""
+        reference = self._of_age(stamp_ns, SEED_AGE_S)
+        if reference is None:
+            return
+        then = reference.scan
+        moving = np.hypot(self._state[:, kalman.VX], self._state[:, kalman.VY]) > SEED_M_S
+        small = self._state[:, kalman.LENGTH] * self._state[:, kalman.WIDTH] < SEED_WITHIN_M2
+        inside = in_tracks(
+            scan.band,
+            np.ascontiguousarray(self._state[moving | small]),
+            scan.origin,
+            self._settings.max_range_m,
+        )
+        owned = np.append(moving | small, False)[owner]
+        taken = owned | (inside != NOBODY)
+        near = np.hypot(scan.band[:, 0], scan.band[:, 1]) < SEED_RANGE_M
+        new = arrived(scan.band, near & ~taken, scan.origin, then.origin, then.starts, then.returns)
+        band = np.ascontiguousarray(scan.band[new])
+        label, count = clusters(band, self._settings.link_m, self._settings.max_range_m)
+        shape = extents(band, label, count)
+        broad = np.hypot(shape[:, 3] - shape[:, 1], shape[:, 4] - shape[:, 2])
+        wanted = (shape[:, 0] >= SEED_POINTS) & (broad <= self._settings.longest_m) & (shape[:, 5] >= LOWEST_TOP_M)  # fmt: skip
+        self._start(dataclasses.replace(scan, band=band), label, count, wanted, scan_index, step_rad)
+
+    def _start(
+        self, scan: VirtualScan, label: I4, count: int, wanted: NDArray[np.bool_], scan_index: int, step_rad: float
+    ) -> None:  # fmt: skip
+        """New tracks from the wanted ones of `count` clusters."""
+        starts, order = grouped(label, count)
         fresh, seen = new_states(
             scan.band, starts, order, np.flatnonzero(wanted), scan.origin, scan.ground, scan.starts, scan.returns, step_rad
         )  # fmt: skip
-        slim = np.minimum(fresh[:, kalman.LENGTH], fresh[:, kalman.WIDTH]) <= s.widest_m
+        slim = np.minimum(fresh[:, kalman.LENGTH], fresh[:, kalman.WIDTH]) <= self._settings.widest_m
         for row in np.column_stack((fresh, seen))[slim]:
             self._ids.append(self._next)
             self._histories[self._next] = History([row], [scan_index], [(0, 0)])
             self._next += 1
         self._state = np.concatenate((self._state, fresh[slim]))
+
+    def _hold_to_size(self, scan: VirtualScan, stamp_ns: int, owner: I4) -> None:
+        """Tracks do not grow into what stood there before them."""
+        reference = self._of_age(stamp_ns, SEED_AGE_S)
+        if reference is None:
+            return
+        then = reference.scan
+        row_then = np.array([reference.number.get(i, -1) for i in self._ids], np.int32)
+        without_background(
+            owner, scan.band, scan.origin, self._state, row_then, reference.boxes, then.origin, then.starts, then.returns
+        )  # fmt: skip
 
     def _merge(self) -> None:
         """Parts of one thing that were taken for several become one track, the oldest of them."""

@@ -187,7 +187,8 @@ def said_of(px: float, py: float, pz: float, starts: I4, returns: F4) -> int:
     around = min(int(side / r * (BINS / (2.0 * np.pi))) + 1, 12)
     middle = bin_of(bearing)
     passed, hidden = False, False
-    for b in range(middle - around, middle + around + 1):
+    for step in range(2 * around + 1):  # 0, 1, -1, 2, ...: what is there is mostly found at once
+        b = middle + (step + 1) // 2 * (1 if step % 2 else -1)
         for k in range(starts[b % BINS], starts[b % BINS + 1]):
             far = np.float64(returns[k, 0])
             rise = returns[k, 1] * (r / far) - pz
