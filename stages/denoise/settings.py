@@ -38,3 +38,4 @@ class Settings(BaseModel):
         0.15, ge=0.02, le=1.0, description="points less than this above the ground's height are ground, m"
     )
     particles: bool = Field(True, description="name what is in the air: dust, snow, rain, spray")
+    moving: bool = Field(True, description="name what the scans shortly before or after see through")

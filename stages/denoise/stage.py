@@ -1,7 +1,7 @@
 """Denoise: a class for every point. Nothing is deleted here; what is not scenery is named.
 
-Own vehicle, out of range, standing alone, ground; then, by the scans shortly before and after, what is in the air; the
-rest is static until a later stage knows better.
+Own vehicle, out of range, standing alone, ground; then, by the scans shortly before and after, what is in the air and
+what moves; the rest is static until a later stage knows better.
 Source: methods 1.5 (Ren et al. 2021, steps c and d) and 2.3.1 for the ground.
 """
 
@@ -18,6 +18,7 @@ from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.stages.denoise.airborne import airborne
 from scanloom.stages.denoise.bounds import bounded
+from scanloom.stages.denoise.moving import Movers
 from scanloom.stages.denoise.settings import Settings
 from scanloom.stages.denoise.window import Moment, View, moments
 from scanloom.stages.geometry.ground import ground_mask
@@ -26,6 +27,7 @@ from scanloom.stages.geometry.motion import MotionTrack
 from scanloom.stages.geometry.range_image import ImageSettings, range_image
 from scanloom.stages.geometry.rig import corrected
 from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.traction import without_slips
 
 VERSION = 2
 
@@ -50,16 +52,20 @@ def denoise(
     A few scans before and after the present one are held. `check` corrects IMU and wheels first.
     """
     T_base_lidar = np.array(session.T_base("lidar"), float)
-    track = MotionTrack.build(*corrected(imu, wheel, check), session)
+    imu, wheel = corrected(imu, wheel, check)
+    track = MotionTrack.build(imu, without_slips(wheel, imu, session).wheel, session)
     views = (view(settings, scan, T_base_lidar, session.beams) for scan in deskewed)
     return Labels(_labelled(settings, moments(views, track, REACH)))
 
 
 def _labelled(settings: Settings, around: Iterator[Moment]) -> Iterator[ScanLabels]:
+    movers = Movers()
     for moment in around:
         scan, classes = moment.view.scan, moment.view.classes.copy()
         if settings.particles:
             classes[airborne(moment)] = PointClass.AIRBORNE
+        if settings.moving:
+            classes[movers.moving(moment, classes)] = PointClass.DYNAMIC
         yield ScanLabels(class_=classes, reference_ns=scan.reference_ns, scan_index=scan.scan_index)
 
 

@@ -1,0 +1,273 @@
+"""What moves, told before odometry: things through whose place the scans shortly before or after see clearly.
+
+A point is looked up in the range images of a few neighbouring scans. Its place is free where such a scan sees something
+well behind it and nothing near or before it in the directions around. Two scans of one side must agree, since what
+drives off is seen through only afterwards, and the other side must not deny it. Then the connected things of the scan are judged as a whole, so that single
+mistakes vanish: most of what the neighbours can tell of must be free. Ground never moves, and where the motion of the
+LiDAR is unknown nothing does. Source: methods 1.5.1, the model-free version.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.schemas.scans import DeskewedScan, PointClass
+from scanloom.stages.denoise.window import Moment, Neighbour, View
+from scanloom.stages.geometry.kernels import kernel
+from scanloom.stages.geometry.range_image import RangeImage, elevation_bin, turn_of
+from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.segments import connected
+from scanloom.stages.geometry.voxels import Int
+
+F4 = NDArray[np.float32]
+B1 = NDArray[np.bool_]
+U1 = NDArray[np.uint8]
+I4 = NDArray[np.int32]
+
+STATIC, GROUND = int(PointClass.STATIC), int(PointClass.GROUND)
+
+FEWEST_SCANS, LOOKS = 3, 3
+"""A neighbour is at least so many scans away; so many of each side are asked, the farthest first."""
+MARGIN_M, MARGIN_PER_M, MARGIN_PER_TRAVEL = 0.3, 0.015, 0.015
+"""What is seen behind a free place is farther by this, growing with range and with the way driven in between."""
+WINDOW_RAD = np.radians(0.45)
+"""Azimuth around a direction in which nothing may be near: attitude is known that well over a second."""
+MOST_COLUMNS = 1024
+"""A finer image is thinned to this."""
+LEAST_FREE = 5
+"""Free points of a thing that moves."""
+FREE_SHARE = 0.5
+"""Of the points of a thing of which a neighbour can tell."""
+DENIED_SHARE = 0.5
+"""Of its free points those may be denied by the other side, which sees long vehicles, and ones that start, in the same place."""
+TOLD_SHARE = 0.3
+"""Of its points a neighbour can tell, at least."""
+LARGEST_M = 25.0
+"""Nothing longer drives on roads."""
+MOST_MOVING, FEW = 0.2, 8
+"""When a larger share of all things seems to move, and more than a few, the motion of the LiDAR must be wrong."""
+
+
+class Movers:
+    """Finds what moves, scan by scan; keeps what it made of the neighbours, which are seen again by the next scans."""
+
+    def __init__(self) -> None:
+        self._screens: dict[int, _Screen] = {}
+
+    def moving(self, moment: Moment, classes: U1) -> B1:
+        """Which points (n,) move, among those that are STATIC in `classes` (n,), values of PointClass."""
+        self._forget(moment)
+        view = moment.view
+        out = np.zeros(len(view.scan), np.bool_)
+        thin = _thinned(view.image, classes)
+        votes = self._votes(moment, thin)
+        if np.count_nonzero(votes.free) < LEAST_FREE:
+            return out
+        thing, count = connected(thin.range_m)
+        moves = _judged(view, thin, thing, count, votes)
+        if moves.any():
+            _spread(
+                view.scan.x_m, view.scan.y_m, view.scan.z_m, classes, view.image.row_of_bin,
+                thin.range_m, thing, moves, out,
+            )  # fmt: skip
+        return out
+
+    def _votes(self, moment: Moment, thin: _Thin) -> _Votes:
+        shape = thin.point.shape
+        told, near = np.zeros(shape, np.bool_), np.zeros((2, *shape), np.bool_)
+        count = np.zeros((2, *shape), np.int8)
+        for k, side in enumerate((-1, 1)):
+            for rank, each in enumerate(_asked(moment.neighbours, side)):
+                self._ask(moment.view.scan, thin, each, rank > 0, count[k], near[k], told)
+        before, after = count > 1
+        return _Votes(before | after, (before & near[1]) | (after & near[0]), told)
+
+    def _ask(
+        self, scan: DeskewedScan, thin: _Thin, neighbour: Neighbour, again: bool, count: NDArray[np.int8], near: B1,
+        told: B1,
+    ) -> None:  # fmt: skip
+        T, screen = neighbour.T_neighbour_scan, self._screen(neighbour.view)
+        if T is None:
+            return
+        margin_m = MARGIN_M + MARGIN_PER_TRAVEL * float(np.linalg.norm(T[:3, 3]))
+        _look(
+            scan.x_m, scan.y_m, scan.z_m, thin.point, np.ascontiguousarray(T), screen.image.range_m,
+            screen.nearest_m, screen.image.row_of_bin, margin_m, again, count, near, told,
+        )  # fmt: skip
+
+    def _screen(self, view: View) -> _Screen:
+        index = view.scan.scan_index
+        if index not in self._screens:
+            self._screens[index] = _Screen.of(view)
+        return self._screens[index]
+
+    def _forget(self, moment: Moment) -> None:
+        around = {each.view.scan.scan_index for each in moment.neighbours}
+        self._screens = {k: screen for k, screen in self._screens.items() if k in around}
+
+
+@dataclass(frozen=True)
+class _Screen:
+    """A neighbour as a screen behind the points of a scan."""
+
+    image: RangeImage
+    nearest_m: F4
+    """(rows, columns) range of the nearest point around each cell that is not ground; inf where there is none."""
+
+    @classmethod
+    def of(cls, view: View) -> _Screen:
+        half = int(np.clip(np.ceil(WINDOW_RAD / view.image.column_rad), 1, 8))
+        return cls(view.image, _nearest(view.image.point, view.image.range_m, view.classes, half))
+
+
+@dataclass(frozen=True)
+class _Thin:
+    """A range image of the points that may move."""
+
+    point: I4
+    """(rows, columns) -1 where there is none."""
+    range_m: F4
+    """(rows, columns) 0 where there is none."""
+
+
+class _Votes(NamedTuple):
+    """What the neighbours say of the place of each cell's point, all (rows, columns)."""
+
+    free: B1
+    """One side saw through."""
+    denied: B1
+    """One side saw through, but the farthest scan of the other saw something there."""
+    told: B1
+    """A neighbour can tell."""
+
+
+def _asked(neighbours: Sequence[Neighbour], side: int) -> list[Neighbour]:
+    """Neighbours of one side that are asked, the farthest first."""
+    known = [
+        each
+        for each in neighbours
+        if each.T_scan_neighbour is not None and each.offset * side >= FEWEST_SCANS
+    ]
+    known.sort(key=lambda each: -abs(each.offset))
+    step = max(1, (len(known) - 1) // (LOOKS - 1)) if known else 1
+    return known[::step][:LOOKS]
+
+
+def _thinned(image: RangeImage, classes: U1) -> _Thin:
+    stride = -(-image.point.shape[1] // MOST_COLUMNS)
+    return _Thin(*_thin(image.point, image.range_m, classes, stride))
+
+
+def _judged(view: View, thin: _Thin, thing: I4, count: Int, votes: _Votes) -> B1:
+    """Which of the `count` things move."""
+    cells = np.flatnonzero(thin.point >= 0)
+    which, point = thing.ravel()[cells], thin.point.ravel()[cells]
+    points = np.bincount(which, minlength=count)
+    free, denied, told = (np.bincount(which, vote.ravel()[cells], minlength=count) for vote in votes)
+    moves: B1 = (
+        (free >= LEAST_FREE)
+        & (free >= FREE_SHARE * told)
+        & (denied <= DENIED_SHARE * free)
+        & (told >= TOLD_SHARE * points)
+    )
+    for one in np.flatnonzero(moves):
+        its = point[which == one]
+        x, y = view.scan.x_m[its], view.scan.y_m[its]
+        moves[one] = np.hypot(np.ptp(x), np.ptp(y)) < LARGEST_M
+    things = np.count_nonzero(told >= LEAST_FREE)
+    if np.count_nonzero(moves) > max(FEW, MOST_MOVING * things):
+        moves[:] = False
+    return moves
+
+
+@kernel
+def _nearest(point: I4, range_m: F4, classes: U1, half: int) -> F4:
+    """Within `half` columns and one row of each cell."""
+    rows, columns = point.shape
+    along = np.full((rows, columns), np.inf, np.float32)
+    for v in range(rows):
+        for u in range(columns):
+            p = point[v, u]
+            if p < 0 or classes[p] == GROUND:
+                continue
+            r = range_m[v, u]
+            for d in range(u - half, u + half + 1):
+                w = d + columns if d < 0 else (d - columns if d >= columns else d)
+                along[v, w] = min(along[v, w], r)
+    out = along.copy()
+    for v in range(rows):
+        for u in range(columns):
+            if v > 0:
+                out[v, u] = min(out[v, u], along[v - 1, u])
+            if v + 1 < rows:
+                out[v, u] = min(out[v, u], along[v + 1, u])
+    return out
+
+
+@kernel
+def _thin(point: I4, range_m: F4, classes: U1, stride: int) -> tuple[I4, F4]:
+    """The nearest STATIC point of every `stride` columns."""
+    rows, columns = point.shape
+    out = np.full((rows, (columns + stride - 1) // stride), -1, np.int32)
+    ranges = np.zeros(out.shape, np.float32)
+    for v in range(rows):
+        for u in range(columns):
+            p, w = point[v, u], u // stride
+            if p >= 0 and classes[p] == STATIC and (out[v, w] < 0 or range_m[v, u] < ranges[v, w]):
+                out[v, w], ranges[v, w] = p, range_m[v, u]
+    return out, ranges
+
+
+@kernel
+def _look(
+    x: F4, y: F4, z: F4, point: I4, T: F8, range_m: F4, nearest_m: F4, row_of_bin: I4, margin_m: float, again: bool,
+    free: NDArray[np.int8], near: B1, told: B1,
+) -> None:  # fmt: skip
+    """Notes, in place, where the neighbour sees through, sees something near, or either; `again` looks only where it was free."""
+    rows, columns = point.shape
+    R = T.astype(np.float32)
+    width = np.float32(range_m.shape[1])
+    base, per_m = np.float32(margin_m), np.float32(MARGIN_PER_M)
+    for v in range(rows):
+        for u in range(columns):
+            i = point[v, u]
+            if i < 0 or (again and free[v, u] == 0):
+                continue
+            px = R[0, 0] * x[i] + R[0, 1] * y[i] + R[0, 2] * z[i] + R[0, 3]
+            py = R[1, 0] * x[i] + R[1, 1] * y[i] + R[1, 2] * z[i] + R[1, 3]
+            pz = R[2, 0] * x[i] + R[2, 1] * y[i] + R[2, 2] * z[i] + R[2, 3]
+            square = px * px + py * py
+            r = np.sqrt(square + pz * pz)
+            row = row_of_bin[elevation_bin(np.sqrt(square), pz)]
+            column = min(int(turn_of(px, py) * width), range_m.shape[1] - 1)
+            margin = base + per_m * r
+            around, behind = nearest_m[row, column], range_m[row, column]
+            if around < r + margin:
+                if around > r - margin and not again:
+                    near[v, u] = told[v, u] = True
+            elif behind > r + margin:
+                told[v, u] = True
+                free[v, u] += 1
+
+
+@kernel
+def _spread(
+    x: F4, y: F4, z: F4, classes: U1, row_of_bin: I4, range_m: F4, thing: I4, moves: B1, out: B1
+) -> None:  # fmt: skip
+    """Marks, in place, the STATIC points whose cell, or the one beside it, holds a moving thing about as far away."""
+    columns = range_m.shape[1]
+    for i in range(len(x)):
+        if classes[i] != STATIC:
+            continue
+        square = x[i] * x[i] + y[i] * y[i]
+        r = np.sqrt(square + z[i] * z[i])
+        row = row_of_bin[elevation_bin(np.sqrt(square), z[i])]
+        column = min(int(turn_of(x[i], y[i]) * np.float32(columns)), columns - 1)
+        label = thing[row, column]
+        if label >= 0 and moves[label]:
+            out[i] = abs(r - range_m[row, column]) < 0.25 + 0.01 * r
