@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8
-from scanloom.stages.objects.filter import HITS, LENGTH, WIDTH, YAW, P, X, Y
+from scanloom.stages.objects.filter import HITS, LENGTH, LENGTH_KNOWN, SURE, WIDTH, WIDTH_KNOWN, YAW, P, X, Y
 
 F4 = NDArray[np.float32]
 I4 = NDArray[np.int32]
@@ -21,7 +21,7 @@ NOBODY, SEVERAL = -1, -2
 OWN_SHARE = 0.4
 """A cluster with so much of it in the box of a track is wholly the track's."""
 GROWS_M = 2.0
-"""A cluster does not reach farther out of the box of its track."""
+"""A cluster does not reach farther out of the box of its track, nor out of its gate once the size is known."""
 
 
 @kernel
@@ -93,4 +93,5 @@ def _close(point: F4, row: F8, origin: F8) -> bool:
     dx, dy = point[0] + origin[0] - row[X], point[1] + origin[1] - row[Y]
     c, s = np.cos(row[YAW]), np.sin(row[YAW])
     u, v = abs(c * dx + s * dy) - 0.5 * row[LENGTH], abs(c * dy - s * dx) - 0.5 * row[WIDTH]
-    return bool(max(u, v) < GROWS_M)
+    known = max(row[LENGTH_KNOWN], row[WIDTH_KNOWN]) >= SURE
+    return bool(max(u, v) < (GATE_M if known else GROWS_M))

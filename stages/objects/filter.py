@@ -41,6 +41,9 @@ USUAL = (4.3, 1.8)
 UNSEEN_M = 4.0
 SHARP_M = 0.4
 """Ends seen less sharply do not tell the size."""
+SURE, GROWTH, LARGE_GROWTH = 5.0, 0.005, 0.03
+"""A size that was seen so often grows by no more than this share from one scan to the next; a large one by the other."""
+LARGE_M = 1.3
 GATE = 25.0
 """A measurement farther off, in squared standard deviations, is of something else."""
 MOVING_M_S, SURE_M_S = 2.0, 1.5
@@ -160,12 +163,15 @@ def _along(row: F8, axis: int, here: float, sides: F8, spread: F8) -> tuple[floa
     size, known = row[LENGTH + axis], row[LENGTH_KNOWN + axis]
     whole = np.isfinite(s_low) and np.isfinite(s_high)
     seen = high - low
+    growth = 1.0 + (LARGE_GROWTH if min(row[LENGTH], row[WIDTH]) > LARGE_M else GROWTH)
     if whole and max(s_low, s_high) < SHARP_M:
         blend = 1.0 / min(known + 1.0, 10.0) if seen < size or known == 0.0 else 0.5
         new = size + blend * (seen - size)
+        if known >= SURE:
+            new = min(new, size * growth)
         row[LENGTH_KNOWN + axis] = known + 1.0
     else:
-        new = max(size, seen)
+        new = max(size, seen if known < SURE else min(seen, size * growth))
     grows = 0.0
     if s_low < s_high:
         grows = 1.0
@@ -179,6 +185,8 @@ def _along(row: F8, axis: int, here: float, sides: F8, spread: F8) -> tuple[floa
     if not np.isfinite(s_low) and not np.isfinite(s_high):
         pushed = min(max(here, high - 0.5 * new), low + 0.5 * new)
         return pushed, UNSEEN_M**2 if pushed == here else 0.5, grows, moved
+    if whole and known >= SURE and not 0.5 * size < seen < size + 0.7:  # a piece of it, or more than it
+        return here, max(0.5 * abs(size - seen), 0.5) ** 2, grows, moved
     weight_low = 1.0 / (s_low * s_low)
     weight_high = 1.0 / (s_high * s_high)
     middle = (weight_low * (low + 0.5 * new) + weight_high * (high - 0.5 * new)) / (weight_low + weight_high)

@@ -25,7 +25,8 @@ SEEN = kalman.STATE
 FULL_TURN = 2.0 * np.pi
 HEADING_M_S = 1.0
 REST_M = 0.5
-LEAST_THROUGH = 3
+LEAST_THROUGH, LEAST_SHARE = 3, 0.08
+"""So many places, and so large a share of the points, must be seen to be empty in a scan to say that it moves."""
 UPRIGHT_M = 0.4
 """Things stand upright: rings of the sensor on the ground, which run along with the vehicle, do not."""
 SIZE_QUANTILE = 0.7
@@ -56,8 +57,9 @@ class ObjectPath:
 def object_path(settings: Settings, history: History, scan_index: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> ObjectPath | None:  # fmt: skip
     """The path of a track that moved, or None; scans and their stamps are those of the odometry."""
     told = np.array(history.asked)
-    moving = (told[:, 0] >= LEAST_THROUGH) & (told[:, 0] > 2 * told[:, 1])
-    score = float(told[:, 0].sum() / max(told.sum(), 1))
+    through, taken, points = told.T
+    moving = (through >= np.maximum(LEAST_THROUGH, LEAST_SHARE * points)) & (through > 2 * taken)
+    score = float(through.sum() / max(through.sum() + taken.sum(), 1))
     if np.count_nonzero(moving) < settings.min_scans or score < settings.min_score:
         return None
     seen = _upright(np.array(history.rows))

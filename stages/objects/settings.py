@@ -37,6 +37,6 @@ class Settings(BaseModel):
         description="share of the places it left, or came to, that were seen to be empty, number",
     )
     parked_s: float = Field(
-        10.0, ge=0.0, le=100.0, description="what stands so long to the end of its track has parked, s"
+        5.0, ge=0.0, le=100.0, description="what stands so long to the end of its track has parked, s"
     )
     lost_s: float = Field(0.6, ge=0.0, le=10.0, description="a track that is not seen for longer ends, s")

@@ -23,7 +23,7 @@ I4 = NDArray[np.int32]
 
 REFERENCE_S = 0.5
 AGES_S = (0.5, 1.5, 4.0)
-MOVED_M = 0.4
+MOVED_M = 0.6
 """Free space is asked of tracks that moved by this between two scans."""
 YOUNG = 3.0
 YOUNG_REACH_M = 2.5
@@ -47,8 +47,9 @@ class History:
     rows: list[F8] = field(default_factory=list)
     """(kalman.STATE + kalman.SEEN,) of each update."""
     scans: list[int] = field(default_factory=list)
-    asked: list[tuple[int, int]] = field(default_factory=list)
-    """Of each update: how many places were seen to be empty that it had left or came to, and how many were not."""
+    asked: list[tuple[int, int, int]] = field(default_factory=list)
+    """Of each update: how many places were seen to be empty that it had left or came to, how many were not, and how many
+    points there were to ask about."""
 
 
 class Tracker:
@@ -103,7 +104,7 @@ class Tracker:
             history = self._histories[self._ids[m]]
             history.rows.append(np.concatenate((self._state[m], seen[m])))
             history.scans.append(scan_index)
-            history.asked.append((0, 0))
+            history.asked.append((0, 0, 0))
 
     def _ask(self, scan: VirtualScan, stamp_ns: int, seen: F8, starts: I4, order: I4) -> None:
         """Hold the present scan and earlier ones against each other, for tracks that moved between them."""
@@ -129,8 +130,8 @@ class Tracker:
             now, reference.boxes[r], reference.scan.origin, reference.scan.starts, reference.scan.returns
         )
         asked_here = self._histories[self._ids[m]].asked
-        through, taken = asked_here[-1]
-        asked_here[-1] = (through + a[0] + b[0], taken + a[1] + b[1])
+        through, taken, points = asked_here[-1]
+        asked_here[-1] = (through + a[0] + b[0], taken + a[1] + b[1], points + len(before) + len(now))
 
     def _of_age(self, stamp_ns: int, age_s: float) -> Reference | None:
         """The kept scan of about that age."""
@@ -204,7 +205,7 @@ class Tracker:
         slim = np.minimum(fresh[:, kalman.LENGTH], fresh[:, kalman.WIDTH]) <= self._settings.widest_m
         for row in np.column_stack((fresh, seen))[slim]:
             self._ids.append(self._next)
-            self._histories[self._next] = History([row], [scan_index], [(0, 0)])
+            self._histories[self._next] = History([row], [scan_index], [(0, 0, 0)])
             self._next += 1
         self._state = np.concatenate((self._state, fresh[slim]))
 

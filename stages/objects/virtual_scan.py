@@ -171,9 +171,10 @@ def _sorted(level: F4, bearing: F4, kind: U1, ground: F4, low: float, high: floa
 
 SAME_M, BEYOND_M = 0.4, 0.6
 """A return this near to a place says that it is taken; one this far behind it that it is empty."""
-SIDE_M = 0.25
-SIDE_SHARE = 0.006
-"""How far a ray may pass beside a place, per metre of range where that is more."""
+SIDE_M, SIDE_SHARE = 0.25, 0.006
+"""How far beside a place something may be that says so, and so much more per metre of range."""
+PASSING_M, PASSING_SHARE = 0.1, 0.003
+"""How far a ray may pass beside a place that it says is empty: not over the roof or past the corner of a car."""
 
 
 @kernel
@@ -183,7 +184,8 @@ def said_of(px: float, py: float, pz: float, starts: I4, returns: F4) -> int:
     if r < 1.0:
         return 0
     bearing = np.arctan2(py, px)
-    side = max(SIDE_M, SIDE_SHARE * r)
+    side = SIDE_M + SIDE_SHARE * r
+    beside = PASSING_M + PASSING_SHARE * r
     around = min(int(side / r * (BINS / (2.0 * np.pi))) + 1, 12)
     middle = bin_of(bearing)
     passed, hidden = False, False
@@ -202,6 +204,6 @@ def said_of(px: float, py: float, pz: float, starts: I4, returns: F4) -> int:
                 return -1
             if far < r:
                 hidden = True
-            elif far > r + BEYOND_M:
+            elif far > r + BEYOND_M and abs(rise) < beside and turn < beside:
                 passed = True
     return 1 if passed and not hidden else 0
