@@ -47,6 +47,9 @@ class Rays(Table):
     hits: NDArray[np.uint8] = column(
         "u1", "bins with a return, not of the ground, in each voxel, x slowest", shape=(BRICK_VOXELS,)
     )
+    tracked: NDArray[np.uint8] = column(
+        "u1", "those of them with a return from what the tracker saw move", shape=(BRICK_VOXELS,)
+    )
     before: NDArray[np.uint8] = column(
         "u1",
         "bins that saw through each voxel before its first hit, or at all without one",

@@ -56,7 +56,7 @@ NODES: tuple[Node, ...] = (
     node("places",     places,     per="chunk",   reads=(Deskewed, Labels, Odometry),          writes=Places),
     node("loops",      loops,      per="map",     reads=(Deskewed, Labels, Odometry, Places),  writes=Loops),
     node("fusion",     fusion,     per="map",     reads=(Session, Odometry, Loops, Gnss, Imu, Wheel, SensorCheck, Base), writes=(Poses, Graph)),
-    node("rays",       rays,       per="chunk",   reads=(Deskewed, Labels, Poses),             writes=Rays),
+    node("rays",       rays,       per="chunk",   reads=(Deskewed, Labels, ObjectTracks, Poses),             writes=Rays),
     node("clean",      clean,      per="tile",    reads=(Rays,),                               writes=Cleared),
     node("relabel",    relabel,    per="chunk",   reads=(Deskewed, Labels, ObjectTracks, Cleared, Poses), writes=(FinalLabels, ClassCounts)),
     node("tiling",     tiling,     per="chunk",   reads=(Deskewed, FinalLabels, Poses),        writes=Piece),

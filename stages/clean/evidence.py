@@ -26,6 +26,7 @@ class Evidence:
     keys: I8
     rows: I4
     hits: U2
+    tracked: U2
     before: U2
     between: U2
     after: U2
@@ -36,21 +37,22 @@ class Evidence:
         keys = np.full(table_length(len(bricks)), EMPTY, np.int64)
         rows = np.zeros(len(keys), np.int32)
         insert_all(keys, rows, bricks)
-        hits, before, between, after = np.zeros((4, len(bricks), BRICK_VOXELS), np.uint16)
-        return cls(bricks, keys, rows, hits, before, between, after)
+        counts = np.zeros((5, len(bricks), BRICK_VOXELS), np.uint16)
+        return cls(bricks, keys, rows, *counts)
 
     def add(self, rays: Rays) -> None:
         """What the next chunk in time says."""
         _add(
-            self.keys, self.rows, rays.brick, rays.hits, rays.before, rays.between, rays.after,
-            self.hits, self.before, self.between, self.after,
+            self.keys, self.rows, rays.brick, rays.hits, rays.tracked, rays.before, rays.between, rays.after,
+            self.hits, self.tracked, self.before, self.between, self.after,
         )  # fmt: skip
 
     @property
     def through(self) -> U2:
         """Bins that saw through each voxel."""
         total = self.before.astype(np.uint32) + self.between + self.after
-        return np.minimum(total, MOST).astype(np.uint16)
+        capped: U2 = np.minimum(total, MOST).astype(np.uint16)
+        return capped
 
 
 def all_bricks(parts: Iterable[Rays]) -> I8:
@@ -61,8 +63,9 @@ def all_bricks(parts: Iterable[Rays]) -> I8:
 
 @kernel
 def _add(
-    keys: I8, rows: I4, brick: I8, more_hits: NDArray[np.uint8], more_before: NDArray[np.uint8],
-    more_between: NDArray[np.uint8], more_after: NDArray[np.uint8], hits: U2, before: U2, between: U2, after: U2,
+    keys: I8, rows: I4, brick: I8, more_hits: NDArray[np.uint8], more_tracked: NDArray[np.uint8],
+    more_before: NDArray[np.uint8], more_between: NDArray[np.uint8], more_after: NDArray[np.uint8], hits: U2, tracked: U2,
+    before: U2, between: U2, after: U2,
 ) -> None:  # fmt: skip
     """Append one chunk's sequence of hits and free bins to what came before it in time."""
     for n in range(len(brick)):
@@ -85,3 +88,4 @@ def _add(
                 between[row, q] = more_between[n, q]
             after[row, q] = more_after[n, q]
             hits[row, q] = min(MOST, np.int64(hits[row, q]) + more_hits[n, q])
+            tracked[row, q] = min(MOST, np.int64(tracked[row, q]) + more_tracked[n, q])

@@ -16,9 +16,10 @@ U1 = NDArray[np.uint8]
 FIRST_BRICKS = 1 << 12
 SATURATED = 255
 
-BLOCKED, PASSED, HIT, HITS, BEFORE, BETWEEN, AFTER = range(7)
-"""Layers of a brick: bins that last blocked, passed and hit a voxel; counts of bins as in `schemas.clean.Rays`."""
-LAYERS = 7
+BLOCKED, PASSED, HIT, TRACKED_HIT, HITS, TRACKED, BEFORE, BETWEEN, AFTER = range(9)
+"""Layers of a brick: bins that last blocked, passed and hit a voxel, the last also of what is tracked; counts of bins as in
+`schemas.clean.Rays`."""
+LAYERS = 9
 
 
 class Field:
@@ -47,7 +48,7 @@ class Field:
     def stamp(self, bin_: int) -> int:
         """Stamp, 1 to 255, of a bin, counted from 1; stamps that come round again are wiped first."""
         if bin_ > 1 and bin_ % SATURATED == 1:
-            self.voxels[:, : HIT + 1] = 0
+            self.voxels[:, : TRACKED_HIT + 1] = 0
         return 1 + (bin_ - 1) % SATURATED
 
     @property
@@ -87,12 +88,12 @@ def row_made(keys: I8, rows: I4, order: I8, count: I8, key: Int) -> Int:
 
 
 @kernel
-def brick_key(i: Int, j: Int, k: Int) -> int:
+def brick_key(i: Int, j: Int, k: Int) -> Int:
     """Key of the brick that holds a voxel."""
     return pack(i >> 3, j >> 3, k >> 3)
 
 
 @kernel
-def inner(i: Int, j: Int, k: Int) -> int:
+def inner(i: Int, j: Int, k: Int) -> Int:
     """Place of a voxel in its brick."""
     return ((i & 7) << 6) | ((j & 7) << 3) | (k & 7)

@@ -102,4 +102,4 @@ def _sine(x: F4, y: F4, z: F4, n: int, other: int) -> float:
     if not square > 0.0:
         return 1.0
     along = dx * px + dy * py + dz * pz
-    return np.sqrt(max(1.0 - along * along / square, 0.0))
+    return float(np.sqrt(max(1.0 - along * along / square, 0.0)))

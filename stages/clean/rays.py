@@ -15,12 +15,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from scanloom.schemas.clean import BRICK_SIDE, Rays
+from scanloom.schemas.objects import ObjectTracks
 from scanloom.schemas.product import Part
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
 from scanloom.schemas.trajectory import Poses
 from scanloom.stages.clean import incidence
-from scanloom.stages.clean.field import AFTER, BEFORE, BETWEEN, HITS
+from scanloom.stages.clean.field import AFTER, BEFORE, BETWEEN, HITS, TRACKED
 from scanloom.stages.clean.field import Field as VoxelField
+from scanloom.stages.clean.moving import MovingBoxes
 from scanloom.stages.clean.tiles import bricks_by_tile
 from scanloom.stages.clean.walking import mark_hits, walk
 
@@ -44,22 +46,29 @@ class Settings(BaseModel):
     clearance_m: float = Field(
         0.3, ge=0.0, le=5.0, description="a ray counts until it comes this close to the surface it meets, m"
     )
+    tracked_margin_m: float = Field(
+        0.1, ge=0.0, le=2.0, description="returns this close to the box of a moving object are its own, m"
+    )
 
 
 Pair = tuple[DeskewedScan, ScanLabels]
 
 
-def rays(settings: Settings, deskewed: Deskewed, labels: Labels, poses: Poses) -> Iterator[Part[Rays]]:
+def rays(
+    settings: Settings, deskewed: Deskewed, labels: Labels, tracks: ObjectTracks, poses: Poses
+) -> Iterator[Part[Rays]]:
     """Bins that hit and that saw through each voxel, for every tile that the chunk's rays cross.
 
     Memory is bounded by the space that the chunk sees.
     """
     T_of = {int(i): T for i, T in zip(poses.scan_index, poses.T_world_lidar) if np.isfinite(T).all()}
-    field, image, first_ns = VoxelField(), incidence.new_image(), 0
+    field, image, first_ns, moving = VoxelField(), incidence.new_image(), 0, MovingBoxes(tracks)
     for number, pairs in enumerate(_bins(deskewed, labels, settings.bin_s), start=1):
         first_ns = first_ns or pairs[0][0].reference_ns
         placed = [
-            (*_seen(scan, label), T_of[scan.scan_index]) for scan, label in pairs if scan.scan_index in T_of
+            (*_seen(scan, label, moving.points(scan, settings.tracked_margin_m)), T_of[scan.scan_index])
+            for scan, label in pairs
+            if scan.scan_index in T_of
         ]
         _mark(settings, field, image, field.stamp(number), placed)
     yield from _parts(settings, field, first_ns, poses.frame)
@@ -77,18 +86,23 @@ def _bins(deskewed: Deskewed, labels: Labels, bin_s: float) -> Iterator[list[Pai
         yield waiting
 
 
-def _seen(scan: DeskewedScan, label: ScanLabels) -> tuple[np.ndarray, ...]:
+def _seen(scan: DeskewedScan, label: ScanLabels, tracked: np.ndarray) -> tuple[np.ndarray, ...]:
+    """x, y, z, class and whether it moved (n,) of the returns that count."""
     rows = np.flatnonzero(np.isin(label.class_, SEEN))
-    return tuple(np.ascontiguousarray(c[rows]) for c in (scan.x_m, scan.y_m, scan.z_m, label.class_))
+    moved = tracked | (label.class_ == PointClass.DYNAMIC)
+    return tuple(np.ascontiguousarray(c[rows]) for c in (scan.x_m, scan.y_m, scan.z_m, label.class_, moved))
 
 
 def _mark(settings: Settings, field: VoxelField, image: np.ndarray, bin_: int, placed: list[tuple]) -> None:
     """All returns of a bin before its rays: a return of one scan blocks the rays of the others."""
-    for x, y, z, classes, T in placed:
+    for x, y, z, classes, moved, T in placed:
         _until_done(
-            field, mark_hits, (x, y, z, classes, T, bin_, settings.reach_m, settings.voxel_size_m), len(x)
+            field,
+            mark_hits,
+            (x, y, z, classes, moved, T, bin_, settings.reach_m, settings.voxel_size_m),
+            len(x),
         )
-    for x, y, z, _, T in placed:
+    for x, y, z, _, _, T in placed:
         clear = incidence.clear_ranges(x, y, z, incidence.fill(x, y, z, image), image, settings.clearance_m)
         _until_done(field, walk, (x, y, z, clear, T, bin_, settings.reach_m, settings.voxel_size_m), len(x))
 
@@ -111,6 +125,7 @@ def _parts(settings: Settings, field: VoxelField, first_ns: int, frame: str) -> 
             Rays(
                 brick=field.bricks[rows],
                 hits=np.ascontiguousarray(layers[:, HITS]),
+                tracked=np.ascontiguousarray(layers[:, TRACKED]),
                 before=np.ascontiguousarray(layers[:, BEFORE]),
                 between=np.ascontiguousarray(layers[:, BETWEEN]),
                 after=np.ascontiguousarray(layers[:, AFTER]),

@@ -3,7 +3,8 @@
 A point's voxel says whether what the session met there moved or has changed. Of a thing that hangs together in a scan, most
 of which moved, all moved: its wheels, which rays to the ground hardly pass, and its roof before the sky, which none passes.
 What the tracker saw drive about moved as well, wherever its box is; free space alone cannot know of a car that stood where nobody
-looked again. Classes that denoise gave for reasons of its own (ground, own vehicle, dust, strays) stay.
+looked again. What denoise took for a stray, for dust or
+for something that moves and the map knows to stand is restored; its other classes (ground, own vehicle, dust) stay.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from scanloom.schemas.trajectory import Poses
 from scanloom.stages.clean import incidence
 from scanloom.stages.clean.clusters import clusters
 from scanloom.stages.clean.lookup import Verdicts
-from scanloom.stages.geometry.boxes import inside_boxes
+from scanloom.stages.clean.moving import MovingBoxes
 from scanloom.stages.geometry.se3 import F8
 
 VERSION = 1
@@ -30,7 +31,11 @@ VERSION = 1
 U1 = NDArray[np.uint8]
 B1 = NDArray[np.bool_]
 I8 = NDArray[np.int64]
-JUDGED = (PointClass.UNLABELLED, PointClass.STATIC)
+DYNAMIC = int(PointClass.DYNAMIC)
+JUDGED = (PointClass.UNLABELLED, PointClass.STATIC, PointClass.DYNAMIC)
+RESTORED = (PointClass.DYNAMIC, PointClass.AIRBORNE, PointClass.OUTLIER)
+"""What denoise took for something else and the map knows to stand."""
+ASKED = (*JUDGED, PointClass.AIRBORNE, PointClass.OUTLIER)
 DECIDED = ((Standing.CHANGED, PointClass.CHANGED), (Standing.MOVED, PointClass.DYNAMIC))
 """What a verdict makes of a point; the last word is the second's."""
 
@@ -64,6 +69,9 @@ class Settings(BaseModel):
     wide_box_margin_m: float = Field(
         0.3, ge=0.0, le=2.0, description="so did points this close to it whose place does not stand, m"
     )
+    foot_m: float = Field(
+        0.08, ge=0.0, le=1.0, description="points in such a box this far above its foot are no ground, m"
+    )
 
 
 def relabel(
@@ -95,17 +103,11 @@ class _Map:
     """What the whole map says of a scan."""
 
     def __init__(self, tracks: ObjectTracks, cleared: Parts[Cleared], poses: Poses) -> None:
-        self.verdicts, self.image = Verdicts(cleared), incidence.new_image()
+        self.verdicts, self.image, self.moving = Verdicts(cleared), incidence.new_image(), MovingBoxes(tracks)
         self._T = {int(i): T for i, T in zip(poses.scan_index, poses.T_world_lidar) if np.isfinite(T).all()}
-        self._tracks = tracks.take(tracks.dynamic)
 
     def pose(self, scan: DeskewedScan) -> F8 | None:
         return self._T.get(scan.scan_index)
-
-    def boxes(self, scan: DeskewedScan) -> F8:
-        """Boxes (m, 15) of what moves in the scan."""
-        first, last = np.searchsorted(self._tracks.scan_index, [scan.scan_index, scan.scan_index + 1])
-        return self._tracks.take(slice(first, last)).boxes()
 
 
 def _relabelled(
@@ -133,30 +135,26 @@ def final(settings: Settings, scan: DeskewedScan, classes: U1, known: _Map) -> U
     T_world_lidar = known.pose(scan)
     if T_world_lidar is None:
         return classes
-    judged = np.isin(classes, JUDGED)
-    said = known.verdicts.of(scan, judged, T_world_lidar)
-    boxed = judged & _boxed(settings, scan, known.boxes(scan), said)
-    said[boxed] = Standing.MOVED
-    out = classes.copy()
+    said = known.verdicts.of(scan, np.isin(classes, ASKED), T_world_lidar)
+    out = np.where((said == Standing.STANDS) & np.isin(classes, RESTORED), PointClass.STATIC, classes).astype(
+        np.uint8
+    )
+    near, around = (known.moving.points(scan, m) for m in (settings.box_margin_m, settings.wide_box_margin_m))
+    judged = np.isin(out, JUDGED)
+    said[judged & (near | (around & (said != Standing.STANDS)))] = Standing.MOVED
+    said[out == PointClass.DYNAMIC] = Standing.MOVED
+    out[(out == PointClass.GROUND) & known.moving.points(scan, settings.box_margin_m, settings.foot_m)] = (
+        DYNAMIC
+    )
     for usable, least in (
         (judged, settings.whole_share),
         (judged & (said != Standing.STANDS), settings.moved_share),
     ):
         thing = _things(settings, scan, usable, known.image)
         for standing, class_ in DECIDED:
-            told = said == standing
+            told = judged & (said == standing)
             out[told | (usable & _of_such(thing, told, settings.least_points, least))] = class_
     return out
-
-
-def _boxed(settings: Settings, scan: DeskewedScan, boxes: F8, said: U1) -> B1:
-    """Points (n,) of what the tracker saw move."""
-    if not len(boxes):
-        return np.zeros(len(scan), np.bool_)
-    xyz = (scan.x_m, scan.y_m, scan.z_m)
-    near = inside_boxes(*xyz, boxes, settings.box_margin_m) >= 0
-    around = inside_boxes(*xyz, boxes, settings.wide_box_margin_m) >= 0
-    return np.asarray(near | (around & (said != Standing.STANDS)))
 
 
 def _things(

@@ -42,6 +42,13 @@ class Settings(BaseModel):
     stands_share: float = Field(
         0.3, ge=0.0, le=1.0, description="stands: seen through at most this many times as often as met, ratio"
     )
+    stands_bins: int = Field(2, ge=1, le=1000, description="stands: met in at least so many bins")
+    tracked_share: float = Field(
+        0.5,
+        ge=0.0,
+        le=1.0,
+        description="moved: this share of the bins that met something met what the tracker saw move",
+    )
     changed_bins: int = Field(
         5, ge=1, le=1000, description="changed: later sessions saw through it in so many bins"
     )
@@ -85,8 +92,9 @@ def _evidence(bricks: np.ndarray, rays: Parts[Rays], numbers: list[int]) -> Evid
 
 def _own(settings: Settings, evidence: Evidence) -> U1:
     verdict: U1 = judge_own(
-        evidence.bricks, evidence.keys, evidence.rows, evidence.hits, evidence.through, evidence.between,
-        settings.seen_through, settings.left_bins, settings.flicker, settings.stands_share,
+        evidence.bricks, evidence.keys, evidence.rows, evidence.hits, evidence.tracked, evidence.through,
+        evidence.between, settings.seen_through, settings.left_bins, settings.flicker, settings.stands_share,
+        settings.stands_bins, settings.tracked_share,
     )  # fmt: skip
     return verdict
 
@@ -99,7 +107,8 @@ def _changed(settings: Settings, evidence: Evidence, verdict: U1, later: np.ndar
 
 
 def _capped(counts: np.ndarray) -> U2:
-    return np.minimum(counts, MOST).astype(np.uint16)
+    capped: U2 = np.minimum(counts, MOST).astype(np.uint16)
+    return capped
 
 
 def _only_own(bricks: np.ndarray, verdict: U1, tile: str, rays: Rays) -> None:

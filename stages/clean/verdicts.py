@@ -9,7 +9,7 @@ from scanloom.schemas.clean import BRICK_SIDE, Standing
 from scanloom.stages.clean.evidence import I4, U2
 from scanloom.stages.clean.field import I8, brick_key, inner, row_of
 from scanloom.stages.geometry.kernels import kernel
-from scanloom.stages.geometry.voxels import unpack
+from scanloom.stages.geometry.voxels import Int, unpack
 
 U1 = NDArray[np.uint8]
 STANDS, MOVED, CHANGED = int(Standing.STANDS), int(Standing.MOVED), int(Standing.CHANGED)
@@ -17,15 +17,15 @@ STANDS, MOVED, CHANGED = int(Standing.STANDS), int(Standing.MOVED), int(Standing
 
 @kernel
 def judge_own(
-    bricks: I8, keys: I8, rows: I4, hits: U2, through: U2, between: U2,
-    share: float, away_bins: int, flicker: float, stands_share: float,
+    bricks: I8, keys: I8, rows: I4, hits: U2, tracked: U2, through: U2, between: U2,
+    share: float, away_bins: int, flicker: float, stands_share: float, stands_bins: int, tracked_share: float,
 ) -> U1:  # fmt: skip
     """MOVED, STANDS or UNKNOWN (bricks, 512) by a session's own bins.
 
     Seen through counts only where all six neighbours were seen through, too: a wall, a roof or a kerb has an inside that
     no ray ever passed. What was met there moved if it was seen through at least `share` times as often as it was met; or,
     for what stood long and then left, `away_bins` times outside of the time it was met, and next to never within (a tree
-    flickers: there, free bins lie between hits).
+    flickers: there, free bins lie between hits). It also moved if `tracked_share` of its hits are of what the tracker saw move.
     """
     out = np.zeros(hits.shape, np.uint8)
     for n in range(len(bricks)):
@@ -36,9 +36,11 @@ def judge_own(
             outside = v - np.int64(between[n, q])
             often = v >= 1 and v >= share * h
             left = outside >= away_bins and between[n, q] <= flicker * outside
-            if (often or left) and open_around(bricks[n], q, n, keys, rows, through):
+            if (tracked[n, q] > 0 and tracked[n, q] >= tracked_share * h) or (
+                (often or left) and open_around(bricks[n], q, n, keys, rows, through)
+            ):
                 out[n, q] = MOVED
-            elif v <= stands_share * h:
+            elif h >= stands_bins and v <= stands_share * h:
                 out[n, q] = STANDS
     return out
 
@@ -58,11 +60,11 @@ def judge_later(
 
 
 @kernel
-def open_around(brick: int, q: int, row: int, keys: I8, rows: I4, through: U2) -> bool:
+def open_around(brick: Int, q: Int, row: Int, keys: I8, rows: I4, through: U2) -> bool:
     """Whether the six voxels beside a voxel were seen through, too."""
     u, v, w = q >> 6, (q >> 3) & 7, q & 7
     if 0 < u < 7 and 0 < v < 7 and 0 < w < 7:
-        return (
+        return bool(
             through[row, q - 1] > 0 and through[row, q + 1] > 0
             and through[row, q - 8] > 0 and through[row, q + 8] > 0
             and through[row, q - 64] > 0 and through[row, q + 64] > 0

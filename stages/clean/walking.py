@@ -17,6 +17,8 @@ from scanloom.stages.clean.field import (
     I8,
     PASSED,
     SATURATED,
+    TRACKED,
+    TRACKED_HIT,
     U1,
     brick_key,
     inner,
@@ -34,7 +36,7 @@ NEAREST_M = 1.0
 
 @kernel
 def mark_hits(
-    x: F4, y: F4, z: F4, classes: U1, T: F8, bin_: Int, reach_m: float, voxel_m: float, start: Int,
+    x: F4, y: F4, z: F4, classes: U1, tracked: NDArray[np.bool_], T: F8, bin_: Int, reach_m: float, voxel_m: float, start: Int,
     keys: I8, rows: I4, order: I8, count: I8, voxels: NDArray[np.uint8],
 ) -> int:  # fmt: skip
     """Mark the voxels of the returns from number `start` on, and those around them as blocked for this bin.
@@ -59,6 +61,10 @@ def mark_hits(
                 brick[AFTER, q] = 0
             if brick[HITS, q] < SATURATED:
                 brick[HITS, q] += 1
+        if tracked[n] and classes[n] != GROUND and brick[TRACKED_HIT, q] != bin_:
+            brick[TRACKED_HIT, q] = bin_
+            if brick[TRACKED, q] < SATURATED:
+                brick[TRACKED, q] += 1
         if px * px + py * py + pz * pz > reach_m * reach_m:
             continue
         if not _block(i, j, k, bin_, row, keys, rows, order, count, voxels):
@@ -80,7 +86,8 @@ def _block(
                 voxels[row, BLOCKED, at] = bin_
                 voxels[row, BLOCKED, at + 1] = bin_
         return True
-    last, at_row = EMPTY, row
+    last: Int = EMPTY
+    at_row: Int = row
     for a in range(i - 1, i + 2):
         for b in range(j - 1, j + 2):
             for c in range(k - 1, k + 2):
@@ -120,7 +127,9 @@ def walk(
         step_i, to_i, along_i = _axis(T[0, 3], dx, i, voxel_m)
         step_j, to_j, along_j = _axis(T[1, 3], dy, j, voxel_m)
         step_k, to_k, along_k = _axis(T[2, 3], dz, k, voxel_m)
-        last, row, t = EMPTY, np.int64(0), NEAREST_M
+        last: Int = EMPTY
+        row: Int = 0
+        t = NEAREST_M
         while t < end:
             key = brick_key(i, j, k)
             if key != last:

@@ -119,7 +119,8 @@ def _scenery(sums: Piece) -> NDArray[np.uint8]:
 
 
 def _left_out(sums: Piece) -> NDArray[np.uint8]:
-    return np.array([0, *LEFT_OUT], np.uint8)[sums.voxel >> RANK_SHIFT]
+    classes: NDArray[np.uint8] = np.array([0, *LEFT_OUT], np.uint8)[sums.voxel >> RANK_SHIFT]
+    return classes
 
 
 def _average(sums: Piece, name: str, sessions: tuple[str, ...]) -> dict[str, Any]:

@@ -99,6 +99,7 @@ def rays_of(
                 settings or RaysSettings(),
                 Deskewed(drive.scans[rows]),
                 Labels(drive.labels[rows]),
+                ObjectTracks.empty(),
                 drive.poses,
             )
             for part in made:

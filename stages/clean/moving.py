@@ -1,0 +1,35 @@
+"""Boxes of what the tracker saw move, scan by scan, and which points of a scan are theirs."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.schemas.objects import ObjectTracks
+from scanloom.schemas.scans import DeskewedScan
+from scanloom.stages.geometry.boxes import inside_boxes
+from scanloom.stages.geometry.se3 import F8
+
+B1 = NDArray[np.bool_]
+
+
+class MovingBoxes:
+    """The rows of the tracks that are dynamic, by scan."""
+
+    def __init__(self, tracks: ObjectTracks) -> None:
+        moving = tracks.take(tracks.dynamic)
+        self._tracks = moving.take(np.argsort(moving.scan_index, kind="stable"))
+
+    def of(self, scan: DeskewedScan) -> F8:
+        """Boxes (m, 15) of what moves in a scan, as `inside_boxes` reads them."""
+        first, last = np.searchsorted(self._tracks.scan_index, [scan.scan_index, scan.scan_index + 1])
+        return self._tracks.take(slice(first, last)).boxes()
+
+    def points(self, scan: DeskewedScan, margin_m: float, above_m: float = 0.0) -> B1:
+        """Points (n,) of a scan within `margin_m` of such a box and at least `above_m` above its foot."""
+        boxes = self.of(scan)
+        if not len(boxes):
+            return np.zeros(len(scan), np.bool_)
+        boxes[:, [3, 7, 11]] += above_m * boxes[:, [2, 6, 10]]
+        boxes[:, 14] = np.maximum(boxes[:, 14] - above_m, 0.0)
+        return np.asarray(inside_boxes(scan.x_m, scan.y_m, scan.z_m, boxes, margin_m) >= 0)
