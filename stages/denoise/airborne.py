@@ -1,10 +1,9 @@
 """What is in the air: dust, snow, rain, spray.
 
-Evidence of three kinds is added up, each as the logarithm of how much more often it is met with particles than with
-solid things: a return weaker than those of solid things at its range; a place off the surfaces around it (methods 1.5.3;
-DROR, Charron et al. 2018, counts neighbours likewise); and neighbouring scans that do not meet it again, or look through
-it. Then what the points next to it say counts, and how much there is in the air at all. What neighbouring scans confirm,
-or what they cannot say anything about, is never airborne.
+Evidence is added up, each kind as the log-odds it gives of a particle against something solid: a return weaker than those
+of solid things at its range; a place off the surfaces around it, with few neighbours (the idea of DROR, Charron et al.
+2018); neighbouring scans that do not meet it again or look through it (methods 1.5.3). Then the points around it are heard,
+and how much there is in the air at all. What neighbouring scans cannot be asked about is never airborne.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.schemas.scans import PointClass
-from scanloom.stages.denoise.weights import CONTEXT, FIRST, FIRST_START, LAST, LAST_START, PRIOR
+from scanloom.stages.denoise import weights
 from scanloom.stages.denoise.window import Moment, View
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.range_image import elevation_bin, turn_of
@@ -25,87 +24,137 @@ U1 = NDArray[np.uint8]
 I4 = NDArray[np.int32]
 I8 = NDArray[np.int64]
 
-GROUND, EGO, OUT_OF_RANGE = int(PointClass.GROUND), int(PointClass.EGO), int(PointClass.OUT_OF_RANGE)
+GROUND, STATIC = int(PointClass.GROUND), int(PointClass.STATIC)
 NEAR, FAR = (-2, -1, 1, 2), (-8, -5, 5, 8)
 """Scans that are asked whether a point is still there."""
 
-
-BAND_EDGES_M = np.array([5.0, 10.0, 20.0, 40.0])
-LEAST_IN_BAND = 100
+STRENGTH, SHAPE, RANGE, ON_GROUND, AGAIN_NEAR, AGAIN_FAR = range(6)
+KINDS, MOST_BINS = 6, weights.BINS
 STRENGTH_EDGES = np.array([0.01, 0.02, 0.035, 0.05, 0.07, 0.1, 0.13, 0.2, 0.27, 0.35, 0.45, 0.6, 0.8])
-BEND_EDGES = np.array([0.3, 0.6, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 50.0])
-COUNT_EDGES = np.array([1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0])
-RANGE_EDGES_M = np.array([3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 25.0, 30.0, 40.0, 60.0])
-BAND_OF_RANGE = np.array([0, 0, 1, 1, 2, 2, 3, 3, 3, 4, 4])
-LOOKED_THROUGH = 6
-CONTEXT_EDGES = np.array([-5.0, -4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
-AMONG_EDGES = np.array([1.0, 3.0, 6.0, 10.0])
-
-STRENGTH, BEND, COUNT, RANGE, ON_GROUND, MET_NEAR, MET_FAR, THROUGH_NEAR, THROUGH_FAR = range(9)
-KINDS, MOST_BINS = 9, 16
 UNKNOWN = MOST_BINS - 1
 """Bin of a strength that the sensor does not tell."""
+MOST_LINES, FAR_OFF = 4, 5.0
+COUNT_EDGES = np.array([1.0, 2.0, 4.0, 8.0])
+SURFACE = (MOST_LINES + 2) * (len(COUNT_EDGES) + 1) - 1
+"""Bin of the shape of a point on a surface."""
+SOLID = MOST_BINS - 1
+"""Bin of the shape of points that are not looked at, since they are solid by other evidence."""
+RANGE_EDGES_M = np.array([5.0, 10.0, 20.0, 40.0])
+NOT_ASKED = 25
+"""Bin of what scans say that are not there."""
+CONTEXT_EDGES = np.array([-5.0, -4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
+AMONG_EDGES = np.array([3.0, 6.0, 10.0])
+
+SAMPLED = 4
+LEAST_IN_BAND = 100
+BRIGHT, BRIGHTER = 0.8, 12
+"""Quantile of the intensities of solid things that strengths are relative to, and the bin that no particle reaches."""
+COMMON, COMMON_BINS = (0.03, 0.08, 0.15, 0.25), (4, 7, 9, 11)
+"""An intensity that this share of solid points stay below is at least in this bin."""
+ROUNDED, SAYS_NOTHING = 0.01, 9
+"""When more than this share of solid points have the very lowest intensity, it is at least in this bin."""
+LOOKED_THROUGH = 6
+"""Cells of nine around a place that show nothing, or something behind it."""
 LIMIT = 6.0
 """A single look is trusted no more than this log-odds."""
+MOST_SHIFT, CLEAR_AIR = 1.0, 0.4
+LEAST_ODDS = -4.0
+"""Points below this after the scan's own evidence are not asked about: others cannot make up for it."""
 
 
-def evidence(moment: Moment) -> U1:
-    """Bin (n, KINDS) of each kind of evidence for each point."""
-    view = moment.view
-    found = np.zeros((len(view.scan), KINDS), np.uint8)
-    own_evidence(view, found)
-    ask(moment, np.flatnonzero(view.image.cell >= 0), found)
+def airborne(moment: Moment) -> B1:
+    """Which points (n,) of the present scan are in the air; none where no neighbouring scan can be asked."""
+    view, scan = moment.view, moment.view.scan
+    out = np.zeros(len(scan), np.bool_)
+    drawn = np.flatnonzero(view.image.cell >= 0)
+    if not moment.known(*NEAR) or not len(drawn):
+        return out
+    found = own_evidence(view)
+    odds = np.full(len(scan), -LIMIT, np.float32)
+    odds[drawn] = log_odds(found, drawn, weights.FIRST)
+    asked = drawn[odds[drawn] > LEAST_ODDS]
+    ask(moment, asked, found)
+    odds[asked] = log_odds(found, asked, weights.FIRST)
+    around = context(view.image.cell, view.image.point, scan.x_m, scan.y_m, scan.z_m, asked, odds)
+    last = log_odds(found, asked, weights.LAST) + weights.CONTEXT[around]
+    out[asked] = last + shift_of(last, len(drawn)) > 0.0
+    return out
+
+
+def own_evidence(view: View) -> U1:
+    """Bins (n, KINDS) of what the scan itself tells; nothing yet of AGAIN_NEAR and AGAIN_FAR."""
+    scan, image = view.scan, view.image
+    found = np.zeros((len(scan), KINDS), np.uint8)
+    drawn = np.flatnonzero(image.cell >= 0)
+    some = np.flatnonzero((image.cell >= 0) & (view.classes == STATIC))[::SAMPLED]
+    _look(image.cell, image.range_m, scan.x_m, scan.y_m, scan.z_m, some, found)
+    edges = strength_edges(view, some, found)
+    unclear = _sift(
+        image.cell, image.range_m, view.classes, scan.x_m, scan.y_m, scan.z_m, scan.intensity, drawn,
+        np.zeros((0, 0)) if edges is None else edges, found,
+    )  # fmt: skip
+    _look(image.cell, image.range_m, scan.x_m, scan.y_m, scan.z_m, unclear, found)
     return found
 
 
-def own_evidence(view: View, found: U1) -> None:
-    """What the scan itself tells: strength of the return, how far off the surfaces around it, neighbours, range."""
-    scan, image = view.scan, view.image
-    bend = _look(image.cell, view.classes, image.range_m, scan.x_m, scan.y_m, scan.z_m, found)
-    usual = usual_strength(view, bend)
-    if usual is None:
-        found[:, STRENGTH] = UNKNOWN
-    else:
-        _strength(image.cell, scan.intensity, found, usual)
+def strength_edges(view: View, some: I8, found: U1) -> F8 | None:
+    """Intensities (bands, edges) between the bins of strength, by range; None when the sensor tells none, or nothing
+    solid is near.
 
-
-def usual_strength(view: View, bend: F4) -> F8 | None:
-    """Median intensity (bands,) of what is solid and upright, by range; None when the sensor tells no intensities."""
-    solid = np.flatnonzero((bend < 1.0) & (view.classes == PointClass.STATIC))
-    intensity = view.scan.intensity[solid]
-    known = np.isfinite(intensity)
-    solid, intensity = solid[known], intensity[known]
-    if len(solid) < LEAST_IN_BAND or np.ptp(intensity) == 0.0:
+    They are relative to bright solid things. But an intensity that many solid points have, such as 0 from a sensor that
+    rounds, says nothing of particles.
+    """
+    intensity, shape = view.scan.intensity[some], found[some, SHAPE]
+    solid = (shape == SURFACE) & np.isfinite(intensity)
+    intensity, band = intensity[solid], _bands(view, some[solid])
+    if len(intensity) < LEAST_IN_BAND or np.ptp(intensity) == 0.0:
         return None
-    band = np.searchsorted(BAND_EDGES_M, view.image.range_m.ravel()[view.image.cell[solid]])
-    overall = float(np.median(intensity))
-    out = np.full(len(BAND_EDGES_M) + 1, overall)
+    faintest = intensity.min()
+    rounded = float(np.mean(intensity == faintest)) > ROUNDED
+    out = np.empty((len(RANGE_EDGES_M) + 1, len(STRENGTH_EDGES)))
     for k in range(len(out)):
         inside = intensity[band == k]
-        if len(inside) >= LEAST_IN_BAND:
-            out[k] = np.median(inside)
-    return out if overall > 0.0 else None
+        common = np.quantile(inside if len(inside) >= LEAST_IN_BAND else intensity, (*COMMON, BRIGHT))
+        if common[-1] <= 0.0:
+            return None
+        out[k] = STRENGTH_EDGES * common[-1]
+        for at, limit in zip(COMMON_BINS, common, strict=False):
+            out[k, :at] = np.minimum(out[k, :at], limit)
+        if rounded:
+            out[k, :SAYS_NOTHING] = np.minimum(out[k, :SAYS_NOTHING], faintest)
+    return out
 
 
-def ask(moment: Moment, asked: NDArray[np.int64], found: U1) -> None:
-    """What the neighbouring scans tell of the points `asked`: how many met them again, how many saw through them."""
+def _bands(view: View, rows: I8) -> I8:
+    x, y, z = view.scan.x_m[rows], view.scan.y_m[rows], view.scan.z_m[rows]
+    bands: I8 = np.searchsorted(RANGE_EDGES_M, np.sqrt(x * x + y * y + z * z), side="right")
+    return bands
+
+
+def ask(moment: Moment, asked: I8, found: U1) -> None:
+    """What neighbouring scans tell of the points `asked`: in how many of four they are met again, and seen through."""
     scan = moment.view.scan
-    for offsets, met, through in ((NEAR, MET_NEAR, THROUGH_NEAR), (FAR, MET_FAR, THROUGH_FAR)):
+    for offsets, kind in ((NEAR, AGAIN_NEAR), (FAR, AGAIN_FAR)):
         known = moment.known(*offsets)
         votes = np.zeros((len(asked), 2), np.uint8)
         for view, T_scan_neighbour in known:
-            _ask(
-                scan.x_m,
-                scan.y_m,
-                scan.z_m,
-                asked,
-                inverse(T_scan_neighbour).astype(np.float32),
-                view.image.range_m,
-                view.image.row_of_bin,
-                votes,
-            )
+            T = inverse(T_scan_neighbour).astype(np.float32)
+            image = view.image
+            _ask(scan.x_m, scan.y_m, scan.z_m, asked, T, image.range_m, image.row_of_bin, votes)
         share = np.rint(4.0 * votes / max(len(known), 1)).astype(np.uint8)
-        found[asked, met], found[asked, through] = share[:, 0], share[:, 1]
+        found[asked, kind] = 5 * share[:, 0] + share[:, 1] if known else NOT_ASKED
+
+
+def shift_of(odds: F8, points: int) -> float:
+    """What the share of particles in this very scan adds to all log-odds; the share is found with it.
+
+    Expectation and maximisation of a mixture's weight. In clear air not all of it counts, since particles keep to places.
+    """
+    usual, shift = np.log(weights.PRIOR / (1.0 - weights.PRIOR)), 0.0
+    for _ in range(6):
+        share = np.clip((1.0 / (1.0 + np.exp(-(odds + shift)))).sum() / points, 1e-5, 0.5)
+        shift = float(np.log(share / (1.0 - share)) - usual)
+    return min(shift, MOST_SHIFT) if shift > 0.0 else CLEAR_AIR * shift
 
 
 @kernel
@@ -117,45 +166,66 @@ def _bin_of(value: float, edges: F8) -> int:
 
 
 @kernel
-def _look(cell: I4, classes: U1, ranges: F4, x: F4, y: F4, z: F4, found: U1) -> F4:
-    """Bins of bend, neighbours, range; returns the bend (n,): how far a point is off the line between two neighbours, in noise."""
-    rows, columns = ranges.shape
-    bend = np.full(len(cell), np.float32(np.inf))
-    for n in range(len(cell)):
-        if cell[n] < 0:
-            continue
-        v, u = cell[n] // columns, cell[n] % columns
+def _sift(
+    cell: I4, ranges: F4, classes: U1, x: F4, y: F4, z: F4, intensity: F4, drawn: I8, edges: F8, found: U1
+) -> I8:
+    """Bins of strength, range, ground; returns the points that are neither as bright as no particle is, nor flat ground."""
+    columns = ranges.shape[1]
+    out, kept = np.empty(len(drawn), np.int64), 0
+    for n in drawn:
         r = np.sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n])
-        best = 1e9
-        for k in range(5):
-            dv, du = (0, 0, 1, 1, 1)[k], (1, 2, 0, 1, -1)[k]
-            if v - dv < 0 or v + dv >= rows:
-                continue
-            a, b = ranges[v + dv, (u + du) % columns], ranges[v - dv, (u - du) % columns]
-            if a > 0.0 and b > 0.0:
-                best = min(best, abs(2.0 * a * b / (a + b) - r))  # planes are straight in 1 / range
-        bend[n] = best / (0.05 + 0.005 * r)
-        tolerance = max(0.3, 0.02 * r)
-        count = 0
-        for dv in range(-1, 2):
-            if v + dv < 0 or v + dv >= rows:
-                continue
-            for du in range(-2, 3):
-                a = ranges[v + dv, (u + du) % columns]
-                count += (dv != 0 or du != 0) and a > 0.0 and abs(a - r) < tolerance
-        found[n, BEND] = _bin_of(bend[n], BEND_EDGES)
-        found[n, COUNT] = _bin_of(count, COUNT_EDGES)
-        found[n, RANGE] = _bin_of(r, RANGE_EDGES_M)
-        found[n, ON_GROUND] = classes[n] == GROUND
-    return bend
+        band = _bin_of(r, RANGE_EDGES_M)
+        found[n, RANGE], found[n, ON_GROUND] = band, classes[n] == GROUND
+        found[n, STRENGTH] = _bin_of(intensity[n], edges[band]) if len(edges) else UNKNOWN
+        solid = len(edges) > 0 and found[n, STRENGTH] >= BRIGHTER
+        if not solid and classes[n] == GROUND:
+            v, u = cell[n] // columns, cell[n] % columns
+            off = _bend(ranges[v, _turned(u + 1, columns)], ranges[v, _turned(u - 1, columns)], r)
+            solid = off < 0.05 + 0.005 * r
+        if solid:
+            found[n, SHAPE] = SOLID
+        else:
+            out[kept] = n
+            kept += 1
+    return out[:kept].copy()
 
 
 @kernel
-def _strength(cell: I4, intensity: F4, found: U1, usual: F8) -> None:
-    for n in range(len(cell)):
-        if cell[n] >= 0:
-            band = found[n, RANGE]
-            found[n, STRENGTH] = _bin_of(intensity[n] / usual[BAND_OF_RANGE[band]], STRENGTH_EDGES)
+def _look(cell: I4, ranges: F4, x: F4, y: F4, z: F4, asked: I8, found: U1) -> None:
+    """Bin of shape of the points `asked`: on how many lines between opposite neighbours they lie, how many are near."""
+    rows, columns = ranges.shape
+    for n in asked:
+        v, u = cell[n] // columns, cell[n] % columns
+        r = np.sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n])
+        noise, tolerance = 0.05 + 0.005 * r, max(0.3, 0.02 * r)
+        low, high = max(v - 1, 0), min(v + 1, rows - 1)
+        bend, straight, count = 1e9, 0, -1
+        for du in range(-2, 3):
+            w, opposite = _turned(u + du, columns), _turned(u - du, columns)
+            for i in range(low, high + 1):
+                a = ranges[i, w]
+                count += a > 0.0 and abs(a - r) < tolerance
+            if du > 0:
+                off = _bend(ranges[v, w], ranges[v, opposite], r)
+                bend, straight = min(bend, off), straight + (off < noise)
+            if abs(du) < 2 and low < v < high:
+                off = _bend(ranges[low, w], ranges[high, opposite], r)
+                bend, straight = min(bend, off), straight + (off < noise)
+        lines = 1 + min(straight, MOST_LINES) if bend < FAR_OFF * noise else 0
+        found[n, SHAPE] = lines * (len(COUNT_EDGES) + 1) + _bin_of(float(count), COUNT_EDGES)
+
+
+@kernel
+def _turned(column: int, columns: int) -> int:
+    if column < 0:
+        return column + columns
+    return column - columns if column >= columns else column
+
+
+@kernel
+def _bend(a: float, b: float, r: float) -> float:
+    """How far range `r` is off the line between its neighbours `a` and `b`: planes are straight in 1 / range."""
+    return abs(2.0 * a * b / (a + b) - r) if a > 0.0 and b > 0.0 else 1e9
 
 
 @kernel
@@ -173,13 +243,9 @@ def _ask(x: F4, y: F4, z: F4, asked: I8, T: F4, ranges: F4, row_of_bin: I4, vote
         u = min(int(turn_of(px, py) * np.float32(columns)), columns - 1)
         same, beyond = 0.2 + 0.01 * r, 0.3 + 0.02 * r
         met, behind = False, 0
-        for dv in range(-1, 2):
-            if v + dv < 0 or v + dv >= rows:
-                continue
+        for i in range(max(v - 1, 0), min(v + 2, rows)):
             for du in range(-1, 2):
-                w = u + du
-                w = w + columns if w < 0 else (w - columns if w >= columns else w)
-                a = ranges[v + dv, w]
+                a = ranges[i, _turned(u + du, columns)]
                 met = met or abs(a - r) < same
                 behind += a == 0.0 or a > r + beyond
         votes[m, 0] += met
@@ -187,13 +253,13 @@ def _ask(x: F4, y: F4, z: F4, asked: I8, T: F4, ranges: F4, row_of_bin: I4, vote
 
 
 @kernel
-def _sum(found: U1, asked: I8, weights: F8, start: float) -> F4:
-    """Log-odds (m,) of the rows `asked`."""
+def log_odds(found: U1, asked: I8, table: F8) -> F4:
+    """Sum (m,) of what each kind of evidence says of the rows `asked`; the table (KINDS + 1, MOST_BINS) ends with a constant."""
     out = np.empty(len(asked), np.float32)
     for m in range(len(asked)):
-        total = start
-        for k in range(found.shape[1]):
-            total += weights[k, found[asked[m], k]]
+        total = table[KINDS, 0]
+        for k in range(KINDS):
+            total += table[k, found[asked[m], k]]
         out[m] = total
     return out
 
@@ -206,58 +272,17 @@ def context(cell: I4, point: I4, x: F4, y: F4, z: F4, asked: I8, odds: F4) -> U1
     for m in range(len(asked)):
         n = asked[m]
         v, u = cell[n] // columns, cell[n] % columns
-        r = np.sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n])
-        near2 = (0.6 + 0.03 * r) ** 2
+        near = 0.6 + 0.03 * np.sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n])
         total, count = 0.0, 0
-        for dv in range(-1, 2):
-            if v + dv < 0 or v + dv >= rows:
-                continue
+        for i in range(max(v - 1, 0), min(v + 2, rows)):
             for du in range(-4, 5):
-                w = u + du
-                w = w + columns if w < 0 else (w - columns if w >= columns else w)
-                j = point[v + dv, w]
+                j = point[i, _turned(u + du, columns)]
                 if j < 0 or j == n:
                     continue
-                if (x[j] - x[n]) ** 2 + (y[j] - y[n]) ** 2 + (z[j] - z[n]) ** 2 < near2:
+                if (x[j] - x[n]) ** 2 + (y[j] - y[n]) ** 2 + (z[j] - z[n]) ** 2 < near * near:
                     total += min(max(odds[j], -LIMIT), LIMIT)
                     count += 1
-        if count:
-            out[m] = (
-                1
-                + _bin_of(total / count, CONTEXT_EDGES) * (len(AMONG_EDGES))
-                + min(_bin_of(float(count), AMONG_EDGES) - 1, len(AMONG_EDGES) - 1)
-            )
+        if count > 0:
+            said = _bin_of(total / count, CONTEXT_EDGES)
+            out[m] = 1 + said * (len(AMONG_EDGES) + 1) + _bin_of(float(count), AMONG_EDGES)
     return out
-
-
-LEAST_ODDS = -3.5
-"""Points below this after the scan's own evidence are not asked about: neighbouring scans add no more than 3."""
-
-
-def airborne(moment: Moment) -> B1:
-    """Which points (n,) of the present scan are in the air; none where no neighbouring scan can be asked."""
-    view, scan = moment.view, moment.view.scan
-    out = np.zeros(len(scan), np.bool_)
-    if not moment.known(*NEAR) or not (view.image.cell >= 0).any():
-        return out
-    found = np.zeros((len(scan), KINDS), np.uint8)
-    own_evidence(view, found)
-    drawn = np.flatnonzero(view.image.cell >= 0)
-    odds = np.full(len(scan), -LIMIT, np.float32)
-    odds[drawn] = _sum(found, drawn, FIRST, FIRST_START)
-    asked = drawn[odds[drawn] > LEAST_ODDS]
-    ask(moment, asked, found)
-    odds[asked] = _sum(found, asked, FIRST, FIRST_START)
-    around = context(view.image.cell, view.image.point, scan.x_m, scan.y_m, scan.z_m, asked, odds)
-    last = _sum(found, asked, LAST, LAST_START) + CONTEXT[around]
-    out[asked] = last + _shift(last, len(drawn)) > 0.0
-    return out
-
-
-def _shift(odds: F8, points: int) -> float:
-    """What to add to all log-odds for the share of particles in this very scan, found with it (expectation, maximisation)."""
-    usual, shift = np.log(PRIOR / (1.0 - PRIOR)), 0.0
-    for _ in range(6):
-        share = np.clip((1.0 / (1.0 + np.exp(-(odds + shift)))).sum() / points, 1e-5, 0.5)
-        shift = float(np.log(share / (1.0 - share)) - usual)
-    return shift

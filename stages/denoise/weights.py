@@ -1,295 +1,77 @@
-"""Weights of the evidence for particles: log-odds, fitted by logistic regression to simulated snow, dust and clear air."""
+"""Weights of the evidence for particles, as log-odds: logistic regressions fitted to simulated snow, dust, spray, clear air.
+
+The bins are those of `airborne`. FIRST judges a point by itself, LAST together with CONTEXT, what is said of its neighbours.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-PRIOR = 0.065
-"""Share of particles where the weights were fitted."""
+from scanloom.stages.geometry.se3 import F8
 
-FIRST_START = -4.4
-FIRST = np.array(
-    [
-        [
-            6.3,
-            2.5,
-            1.5,
-            0.9,
-            0.7,
-            0.3,
-            0.2,
-            -0.3,
-            -0.9,
-            -1.8,
-            -2.0,
-            -1.9,
-            -2.4,
-            -3.2,
-            0.0,
-            0.0,
-        ],  # strength of the return over the usual one
-        [
-            -3.1,
-            -1.9,
-            -0.4,
-            0.6,
-            1.1,
-            1.5,
-            1.6,
-            1.2,
-            0.1,
-            -0.8,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-        ],  # off the surfaces around
-        [2.3, 1.0, 0.3, 0.1, -0.7, -0.7, -1.1, -1.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],  # neighbours
-        [4.7, 5.7, 3.7, 2.3, 0.7, -0.4, -0.9, -1.9, -3.0, -6.1, -4.9, 0.0, 0.0, 0.0, 0.0, 0.0],  # range
-        [2.5, -2.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],  # on the ground
-        [
-            0.7,
-            0.4,
-            0.0,
-            -0.3,
-            -0.9,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-        ],  # met again, scans nearby
-        [
-            0.3,
-            0.3,
-            0.3,
-            -0.2,
-            -0.7,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-        ],  # met again, scans farther off
-        [
-            -0.1,
-            -0.6,
-            -0.6,
-            0.3,
-            1.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-        ],  # seen through, scans nearby
-        [
-            -0.6,
-            -0.5,
-            0.3,
-            0.2,
-            0.6,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-        ],  # seen through, scans farther off
-    ]
+BINS = 32
+NEVER = -30.0
+PRIOR = 0.067
+"""Share of particles among all points of the scans that the weights were fitted to."""
+
+
+def _table(*kinds: list[float], unknown_strength: float) -> F8:
+    """(kinds, BINS), filled up with zeros; the last bins of the first two: no intensities; solid by other evidence."""
+    out = np.zeros((len(kinds), BINS))
+    for row, kind in zip(out, kinds, strict=True):
+        row[: len(kind)] = kind
+    out[0, -1], out[1, -1] = unknown_strength, NEVER
+    return out
+
+
+# fmt: off
+FIRST = _table(
+    # strength over the usual one
+    [1.8, 0.1, 0.0, 0.4, 0.5, 0.4, 0.5, 0.7, 0.2, -0.8, -2.4, -0.6, 0.0, 0.0],
+    # shape: lines through the point, points around it
+    [2.2, 1.4, 0.7, 0.1, -0.3, 1.9, 1.6, 1.9, 2.2, 2.0, 1.3, 0.8, -0.3, 0.3, 0.0,
+     0.6, -0.2, -1.0, -2.0, -1.2, -0.2, -0.6, -1.4, -0.5, -0.9, 0.0, -0.3, -1.9, -2.9, -3.5],
+    # range
+    [2.9, 1.9, -0.3, -0.6, -4.0],
+    # on the ground
+    [2.2, -2.4],
+    # scans nearby: met again, seen through
+    [1.1, 0.4, 0.0, 0.5, 2.0, 0.9, 0.0, -0.1, 0.4, 1.3, 0.2, 0.1, -0.3, 0.1, 0.3,
+     0.4, 0.0, -0.6, -0.5, -0.8, -0.6, -0.9, -1.1, -1.2, -1.6],
+    # scans farther off: met again, seen through
+    [0.2, 0.2, 1.1, 0.7, 0.8, 0.5, 0.5, 1.5, 0.5, 1.1, -0.5, 0.3, 0.8, 0.9, 0.2,
+     -0.4, -0.3, 0.4, 0.1, -0.3, -2.4, -1.5, -1.7, -1.1, -1.6],
+    # constant
+    [-3.9],
+    unknown_strength=-1.1,
 )
 
-LAST_START = -2.9
-LAST = np.array(
-    [
-        [
-            5.9,
-            2.4,
-            1.4,
-            0.8,
-            0.5,
-            0.2,
-            0.1,
-            -0.3,
-            -0.7,
-            -1.4,
-            -1.7,
-            -1.9,
-            -2.3,
-            -3.1,
-            0.0,
-            0.0,
-        ],  # strength of the return over the usual one
-        [
-            -3.2,
-            -1.9,
-            -0.5,
-            0.5,
-            1.1,
-            1.5,
-            1.6,
-            1.3,
-            0.2,
-            -0.7,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-        ],  # off the surfaces around
-        [2.0, 0.9, 0.0, -0.1, -0.5, -0.9, -0.7, -0.8, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],  # neighbours
-        [2.9, 4.4, 2.9, 2.2, 1.2, 0.3, -0.2, -1.2, -2.3, -5.5, -4.6, 0.0, 0.0, 0.0, 0.0, 0.0],  # range
-        [1.9, -1.9, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],  # on the ground
-        [
-            0.6,
-            0.4,
-            0.0,
-            -0.3,
-            -0.8,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-        ],  # met again, scans nearby
-        [
-            0.1,
-            0.1,
-            0.2,
-            0.0,
-            -0.4,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-        ],  # met again, scans farther off
-        [
-            -0.1,
-            -0.6,
-            -0.6,
-            0.3,
-            1.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-        ],  # seen through, scans nearby
-        [
-            -0.4,
-            -0.4,
-            0.2,
-            0.0,
-            0.5,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-        ],  # seen through, scans farther off
-    ]
+LAST = _table(
+    # strength over the usual one
+    [2.2, 0.2, 0.0, 0.2, 0.3, 0.3, 0.3, 0.4, 0.0, -0.7, -1.8, -0.8, 0.0, 0.0],
+    # shape: lines through the point, points around it
+    [2.2, 1.4, 0.7, 0.2, -0.2, 2.1, 1.5, 1.5, 1.7, 1.9, 1.3, 0.7, -0.5, -0.2, -0.2,
+     0.4, 0.0, -0.9, -2.0, -1.4, 0.0, -0.4, -1.1, -0.8, -0.8, 0.1, -0.1, -1.6, -2.8, -2.8],
+    # range
+    [1.3, 1.1, 0.3, 0.3, -3.1],
+    # on the ground
+    [1.3, -1.4],
+    # scans nearby: met again, seen through
+    [0.5, 0.3, 0.0, 0.4, 1.9, 0.5, -0.2, -0.1, 0.5, 1.4, -0.1, -0.4, -0.4, 0.1, 0.3,
+     0.3, -0.2, -0.5, -0.6, -0.5, -0.3, -0.6, -0.7, -0.6, -1.0],
+    # scans farther off: met again, seen through
+    [0.1, 0.0, 0.5, 0.2, 0.2, 0.3, 0.3, 0.9, 0.1, 0.7, -0.4, 0.1, 0.6, 0.8, 0.0,
+     -0.1, -0.1, 0.6, 0.1, 0.0, -1.4, -0.6, -1.0, -0.9, -1.1],
+    # constant
+    [-2.4],
+    unknown_strength=-0.8,
 )
+
 CONTEXT = np.array(
-    [
-        -0.1,
-        -2.2,
-        -2.3,
-        -1.7,
-        -1.2,
-        -2.6,
-        -2.9,
-        -2.0,
-        -1.3,
-        -2.9,
-        -3.0,
-        -2.2,
-        -1.2,
-        -2.6,
-        -3.1,
-        -2.1,
-        -1.3,
-        -2.5,
-        -2.4,
-        -2.0,
-        -0.5,
-        -1.9,
-        -1.7,
-        -1.3,
-        1.1,
-        -1.1,
-        -0.8,
-        -0.2,
-        3.5,
-        -0.1,
-        0.6,
-        1.3,
-        4.3,
-        1.1,
-        2.0,
-        3.6,
-        4.7,
-        1.9,
-        2.8,
-        3.8,
-        3.3,
-        1.6,
-        2.9,
-        3.0,
-        1.9,
-        1.8,
-        2.3,
-        1.4,
-        0.7,
-    ]
+    # no points around; then by their mean, from solid to airborne, in rows by how many they are
+    [-0.3, -2.6, -2.8, -2.0, -2.0, -1.9, -3.1, -2.3, -2.0, -2.4, -3.0, -2.4, -1.3,
+     -2.4, -2.6, -1.7, -0.4, -2.6, -2.3, -1.4, 0.5, -2.1, -1.1, -0.3, 1.5,
+     -0.4, 0.9, 1.2, 2.8, 0.3, 1.6, 1.8, 3.6, 1.2, 2.5, 2.5, 3.5,
+     1.5, 2.1, 2.7, 3.2, 1.8, 1.8, 1.9, 2.1, 1.6, 1.2, 0.7, 0.5]
 )
+# fmt: on
