@@ -21,7 +21,7 @@ from scanloom.stages.denoise.window import Moment, Neighbour, View
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.range_image import RangeImage, elevation_bin, turn_of
 from scanloom.stages.geometry.se3 import F8
-from scanloom.stages.geometry.segments import connected
+from scanloom.stages.geometry.segments import alike, connected
 from scanloom.stages.geometry.voxels import Int
 
 F4 = NDArray[np.float32]
@@ -37,8 +37,8 @@ MARGIN_M, MARGIN_PER_M, MARGIN_PER_TRAVEL = 0.3, 0.015, 0.015
 """What is seen behind a free place is farther by this, growing with range and with the way driven in between."""
 WINDOW_RAD = np.radians(0.45)
 """Azimuth around a direction in which nothing may be near: attitude is known that well over a second."""
-MOST_COLUMNS = 1024
-"""A finer image is thinned to this."""
+MOST_CELLS = 45_000
+"""A finer image is thinned to this, along its rows."""
 LEAST_FREE = 5
 """Free points of a thing that moves."""
 FREE_SHARE = 0.5
@@ -70,12 +70,14 @@ class Movers:
             return out
         thing, count = connected(thin.range_m)
         moves = _judged(view, thin, thing, count, votes)
-        if moves.any():
-            _spread(
-                view.scan.x_m, view.scan.y_m, view.scan.z_m, classes, view.image.row_of_bin,
-                thin.range_m, thing, moves, out,
-            )  # fmt: skip
-        return out
+        if not moves.any():
+            return out
+        scan, image = view.scan, view.image
+        marked: B1 = _spread(
+            scan.x_m, scan.y_m, scan.z_m, classes, image.point, image.range_m, image.row_of_bin,
+            thin.range_m, thin.stride, thing, moves,
+        )  # fmt: skip
+        return marked
 
     def _votes(self, moment: Moment, thin: _Thin) -> _Votes:
         shape = thin.point.shape
@@ -133,6 +135,8 @@ class _Thin:
     """(rows, columns) -1 where there is none."""
     range_m: F4
     """(rows, columns) 0 where there is none."""
+    stride: int
+    """Columns of the image in one of these."""
 
 
 class _Votes(NamedTuple):
@@ -159,26 +163,22 @@ def _asked(neighbours: Sequence[Neighbour], side: int) -> list[Neighbour]:
 
 
 def _thinned(image: RangeImage, classes: U1) -> _Thin:
-    stride = -(-image.point.shape[1] // MOST_COLUMNS)
-    return _Thin(*_thin(image.point, image.range_m, classes, stride))
+    stride = max(1, -(-image.point.size // MOST_CELLS))
+    return _Thin(*_thin(image.point, image.range_m, classes, stride), stride)
 
 
 def _judged(view: View, thin: _Thin, thing: I4, count: Int, votes: _Votes) -> B1:
     """Which of the `count` things move."""
-    cells = np.flatnonzero(thin.point >= 0)
-    which, point = thing.ravel()[cells], thin.point.ravel()[cells]
-    points = np.bincount(which, minlength=count)
-    free, denied, told = (np.bincount(which, vote.ravel()[cells], minlength=count) for vote in votes)
+    points, free, denied, told, length_m = _counted(
+        view.scan.x_m, view.scan.y_m, thin.point, thing, count, *votes
+    )
     moves: B1 = (
         (free >= LEAST_FREE)
         & (free >= FREE_SHARE * told)
         & (denied <= DENIED_SHARE * free)
         & (told >= TOLD_SHARE * points)
+        & (length_m < LARGEST_M)
     )
-    for one in np.flatnonzero(moves):
-        its = point[which == one]
-        x, y = view.scan.x_m[its], view.scan.y_m[its]
-        moves[one] = np.hypot(np.ptp(x), np.ptp(y)) < LARGEST_M
     things = np.count_nonzero(told >= LEAST_FREE)
     if np.count_nonzero(moves) > max(FEW, MOST_MOVING * things):
         moves[:] = False
@@ -256,18 +256,49 @@ def _look(
 
 
 @kernel
+def _counted(
+    x: F4, y: F4, point: I4, thing: I4, count: int, free: B1, denied: B1, told: B1
+) -> tuple[I4, I4, I4, I4, F4]:
+    """Of each thing (count,): points, how many of them are free, denied, told; and the diagonal of its outline, m."""
+    sums = np.zeros((4, count), np.int32)
+    low, high = np.full((2, count), np.inf, np.float32), np.full((2, count), -np.inf, np.float32)
+    rows, columns = point.shape
+    for v in range(rows):
+        for u in range(columns):
+            k, i = thing[v, u], point[v, u]
+            if k < 0:
+                continue
+            sums[0, k] += 1
+            sums[1, k] += free[v, u]
+            sums[2, k] += denied[v, u]
+            sums[3, k] += told[v, u]
+            low[0, k], high[0, k] = min(low[0, k], x[i]), max(high[0, k], x[i])
+            low[1, k], high[1, k] = min(low[1, k], y[i]), max(high[1, k], y[i])
+    length_m = np.sqrt((high[0] - low[0]) ** 2 + (high[1] - low[1]) ** 2)
+    return sums[0], sums[1], sums[2], sums[3], length_m
+
+
+@kernel
 def _spread(
-    x: F4, y: F4, z: F4, classes: U1, row_of_bin: I4, range_m: F4, thing: I4, moves: B1, out: B1
-) -> None:  # fmt: skip
-    """Marks, in place, the STATIC points whose cell, or the one beside it, holds a moving thing about as far away."""
-    columns = range_m.shape[1]
+    x: F4, y: F4, z: F4, classes: U1, point: I4, range_m: F4, row_of_bin: I4, thin_m: F4, stride: int, thing: I4,
+    moves: B1,
+) -> B1:  # fmt: skip
+    """The STATIC points (n,) in whose cell lies a moving thing about as far away."""
+    out, drawn = np.zeros(len(x), np.bool_), np.zeros(len(x), np.bool_)
+    rows, columns = point.shape
+    for v in range(rows):
+        for u in range(columns):
+            i, w = point[v, u], u // stride
+            if i >= 0:
+                drawn[i] = True
+                if classes[i] == STATIC and thing[v, w] >= 0 and moves[thing[v, w]]:
+                    out[i] = alike(range_m[v, u], thin_m[v, w])
     for i in range(len(x)):
-        if classes[i] != STATIC:
+        if drawn[i] or classes[i] != STATIC:
             continue
-        square = x[i] * x[i] + y[i] * y[i]
-        r = np.sqrt(square + z[i] * z[i])
-        row = row_of_bin[elevation_bin(np.sqrt(square), z[i])]
-        column = min(int(turn_of(x[i], y[i]) * np.float32(columns)), columns - 1)
-        label = thing[row, column]
-        if label >= 0 and moves[label]:
-            out[i] = abs(r - range_m[row, column]) < 0.25 + 0.01 * r
+        level = np.sqrt(x[i] * x[i] + y[i] * y[i])
+        v = row_of_bin[elevation_bin(level, z[i])]
+        w = min(int(turn_of(x[i], y[i]) * np.float32(columns)), columns - 1) // stride
+        if thing[v, w] >= 0 and moves[thing[v, w]]:
+            out[i] = alike(np.sqrt(level * level + z[i] * z[i]), thin_m[v, w])
+    return out

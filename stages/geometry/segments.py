@@ -33,7 +33,7 @@ def connected(range_m: F4) -> tuple[I4, Int]:
     for v in range(rows):  # round the seam
         for u in range(min(2, columns)):
             for w in range(columns - 2 + u, columns):
-                if range_m[v, u] > 0.0 and range_m[v, w] > 0.0 and _alike(range_m[v, u], range_m[v, w]):
+                if range_m[v, u] > 0.0 and range_m[v, w] > 0.0 and alike(range_m[v, u], range_m[v, w]):
                     _join(parent, v * columns + u, v * columns + w)
     out = np.full((rows, columns), -1, np.int32)
     numbers = np.full(rows * columns, -1, np.int32)
@@ -56,21 +56,22 @@ def _join_before(range_m: F4, parent: I4, v: int, u: int) -> None:
     here, r = v * columns + u, range_m[v, u]
     for back in (1, 2):
         if u >= back and range_m[v, u - back] > 0.0:
-            if _alike(r, range_m[v, u - back]):
+            if alike(r, range_m[v, u - back]):
                 _join(parent, here, here - back)
             break
     for down in (1, 2):
         if v < down:
             break
         for w in range(max(u - 1, 0), min(u + 2, columns)):
-            if range_m[v - down, w] > 0.0 and _alike(r, range_m[v - down, w]):
+            if range_m[v - down, w] > 0.0 and alike(r, range_m[v - down, w]):
                 _join(parent, here, (v - down) * columns + w)
         if range_m[v - down, u] > 0.0:
             break
 
 
 @kernel
-def _alike(a: float, b: float) -> bool:
+def alike(a: float, b: float) -> bool:
+    """Whether two ranges, m, next to each other may be of one thing."""
     return abs(a - b) < STEP_M + STEP_PER_M * min(a, b)
 
 
