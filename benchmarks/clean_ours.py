@@ -8,13 +8,15 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import multiprocessing
-import os
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing.pool import Pool
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,12 +28,14 @@ from scanloom.schemas.clean import Cleared, FinalLabels, Rays
 from scanloom.schemas.product import Coordinate, Part, Parts, Product
 from scanloom.schemas.scans import Deskewed, Labels
 from scanloom.schemas.trajectory import Poses
+from scanloom.stages.geometry import halves
 
 PROCESSES = 2
 SESSION: Coordinate = (("session", "bench"),)
 WARM_UP = 4
 """Scans of a first run that loads compiled code."""
 
+T = TypeVar("T")
 Settings = Mapping[str, Mapping[str, Any]]
 Files = list[tuple[Coordinate, Path]]
 
@@ -113,8 +117,7 @@ def final_classes(work: Job) -> tuple[NDArray[np.uint8], float]:
     _load_kernels(work)
     global _work
     _work = work
-    with multiprocessing.get_context("fork").Pool(PROCESSES) as pool:
-        pool.map(_alone, range(PROCESSES))
+    with processes(PROCESSES) as pool:
         started = time.perf_counter()
         numbers = range(len(work.deskewed))
         rays = sorted(itertools.chain.from_iterable(pool.imap_unordered(_rays, numbers)))
@@ -126,6 +129,37 @@ def final_classes(work: Job) -> tuple[NDArray[np.uint8], float]:
     return np.concatenate([*itertools.chain.from_iterable(classes)]), seconds
 
 
+@contextmanager
+def processes(count: int) -> Iterator[Pool]:
+    """Copies of this process, which end of themselves."""
+    pool = multiprocessing.get_context("fork").Pool(count, initializer=_wake_helper)
+    try:
+        yield pool
+    finally:
+        pool.close()
+        pool.join()
+
+
+def apart(errand: Callable[[], T]) -> T:
+    """Do something in a copy of this process, which its threads and its handling of signals do not outlive."""
+    global _errand
+    _errand = errand
+    with processes(1) as pool:
+        done: T = pool.apply(_run_errand)
+    return done
+
+
+def _run_errand() -> Any:
+    assert _errand is not None
+    return _errand()
+
+
+def _wake_helper() -> None:
+    """Threads do not come along into a copy of a process."""
+    halves._helper = ThreadPoolExecutor(1)
+
+
+_errand: Callable[[], Any] | None = None
 _work: Job | None = None
 """Of the processes: they are copies of the one that set it."""
 
@@ -133,10 +167,6 @@ _work: Job | None = None
 def _mine() -> Job:
     assert _work is not None
     return _work
-
-
-def _alone(_: int) -> None:
-    os.environ["NUMBA_NUM_THREADS"] = "1"
 
 
 def _rays(number: int) -> Files:

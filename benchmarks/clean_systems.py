@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.clean_nearness import Mask
-from benchmarks.clean_ours import PROCESSES, Settings, cleaned
+from benchmarks.clean_ours import PROCESSES, Settings, apart, cleaned
 from benchmarks.clean_scenes import Scene
 from benchmarks.clean_scores import STANDING
 from scanloom import stages
@@ -83,6 +83,10 @@ def _denoised(scene: Scene, poses: str, variant: str, settings: Settings) -> Out
 
 
 def _dufomap(scene: Scene, poses: str, variant: str, settings: Settings) -> Outcome:
+    return apart(lambda: _integrated(scene, poses, variant))
+
+
+def _integrated(scene: Scene, poses: str, variant: str) -> Outcome:
     """Integration, propagation and the segmentation of every scan; reading is no part of the time."""
     from dufomap import dufomap
 
