@@ -51,7 +51,8 @@ class ObjectTracks(Table):
         "?", "its points belong to something that moves; false once it stands to the end of its track"
     )
     score: NDArray[np.float64] = column(
-        "f8", "share of what was asked of free space that says it moved, 0 to 1; the same for the whole track"
+        "f8",
+        "share of the places it left, or came to, that were seen to be empty, 0 to 1; the same for the whole track",
     )
 
     def boxes(self) -> NDArray[np.float64]:

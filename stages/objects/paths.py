@@ -17,7 +17,7 @@ from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.objects import filter as kalman
 from scanloom.stages.objects.settings import Settings
-from scanloom.stages.objects.tracker import History
+from scanloom.stages.objects.tracker import AGES_S, MOVED_M, History
 
 B1 = NDArray[np.bool_]
 
@@ -56,11 +56,8 @@ class ObjectPath:
 
 def object_path(settings: Settings, history: History, scan_index: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> ObjectPath | None:  # fmt: skip
     """The path of a track that moved, or None; scans and their stamps are those of the odometry."""
-    told = np.array(history.asked)
-    through, taken, points = told.T
-    moving = (through >= np.maximum(LEAST_THROUGH, LEAST_SHARE * points)) & (through > 2 * taken)
-    score = float(through.sum() / max(through.sum() + taken.sum(), 1))
-    if np.count_nonzero(moving) < settings.min_scans or score < settings.min_score:
+    moving = _says_moving(np.array(history.asked))
+    if np.count_nonzero(moving) < settings.min_scans:
         return None
     seen = _upright(np.array(history.rows))
     if np.count_nonzero(seen[:, SEEN + kalman.UPRIGHT] >= UPRIGHT_M) < settings.min_scans:
@@ -72,8 +69,10 @@ def object_path(settings: Settings, history: History, scan_index: NDArray[np.int
     t = (stamp_ns[rows] - stamp_ns[first]) * 1e-9
     measured, R = _measured(seen, size, place, len(rows))
     path, variance = smooth(t, measured, R)
-    moved = _moved(settings, path, variance)
-    if not moved:
+    displaced = _displaced(t, path)[place]
+    score = _score(np.array(history.asked)[displaced])
+    enough = np.count_nonzero(moving & displaced) >= settings.min_scans and score >= settings.min_score
+    if not enough or not _moved(settings, path, variance):
         return None
     speed = np.hypot(path[:, 2], path[:, 3])
     yaw = _yaw(seen[:, kalman.YAW], place, path, speed, size)
@@ -88,6 +87,26 @@ def object_path(settings: Settings, history: History, scan_index: NDArray[np.int
         kind=_kind(size, speed),
         score=score,
     )
+
+
+def _says_moving(asked: NDArray[np.int64]) -> B1:
+    """In which updates (n,) free space says that the track moves; `asked` (n, 3) as in its history."""
+    through, taken, points = asked.T
+    enough = through >= np.maximum(LEAST_THROUGH, LEAST_SHARE * points)
+    return np.asarray(enough & (through > 2 * taken))
+
+
+def _score(asked: NDArray[np.int64]) -> float:
+    through, taken, _ = asked.sum(axis=0)
+    return float(through / max(through + taken, 1))
+
+
+def _displaced(t: F8, path: F8) -> B1:
+    """Where (n,) the path has led away from where it was some seconds before: elsewhere free space was asked because the
+    box wandered while its size became known."""
+    places = np.stack([path[np.searchsorted(t, t - age), :2] for age in (0.0, *AGES_S)])
+    low, high = places.min(axis=0), places.max(axis=0)
+    return np.asarray(np.hypot(*(high - low).T) > MOVED_M)
 
 
 def _upright(rows: F8) -> F8:

@@ -33,10 +33,9 @@ LEAST_TRACK_POINTS = 3
 LOWEST_TOP_M = 0.5
 SEED_EVERY = 3
 """Every third scan is searched for what arrived beside something larger."""
-SEED_AGE_S = 0.5
 SEED_RANGE_M = 30.0
 SEED_POINTS = 8
-SEED_M_S, SEED_WITHIN_M2 = 0.7, 4.0
+SEED_M_S, SEED_WIDTH_M, SEED_WITHIN_M2 = 0.7, 2.8, 4.0
 """What arrived in the box of something that moves, or that is no larger, is not something new."""
 
 
@@ -171,11 +170,12 @@ class Tracker:
         self, scan: VirtualScan, stamp_ns: int, owner: I4, scan_index: int, step_rad: float
     ) -> None:
         """New tracks from what arrived beside something larger, a wall or a hedge, since an earlier scan."""
-        reference = self._of_age(stamp_ns, SEED_AGE_S)
+        reference = self._of_age(stamp_ns, AGES_S[1]) or self._of_age(stamp_ns, AGES_S[0])
         if reference is None:
             return
         then = reference.scan
         moving = np.hypot(self._state[:, kalman.VX], self._state[:, kalman.VY]) > SEED_M_S
+        moving &= np.minimum(self._state[:, kalman.LENGTH], self._state[:, kalman.WIDTH]) < SEED_WIDTH_M
         small = self._state[:, kalman.LENGTH] * self._state[:, kalman.WIDTH] < SEED_WITHIN_M2
         inside = in_tracks(
             scan.band,
@@ -211,7 +211,7 @@ class Tracker:
 
     def _hold_to_size(self, scan: VirtualScan, stamp_ns: int, owner: I4) -> None:
         """Tracks do not grow into what stood there before them."""
-        reference = self._of_age(stamp_ns, SEED_AGE_S)
+        reference = self._of_age(stamp_ns, AGES_S[0])
         if reference is None:
             return
         then = reference.scan
