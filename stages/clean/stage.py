@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from scanloom.schemas.clean import BRICK_SIDE, BRICK_VOXELS, Cleared, Rays, Standing
+from scanloom.schemas.errors import StageError
 from scanloom.schemas.product import Part, Parts
 from scanloom.stages.clean.evidence import MOST, U2, Evidence, all_bricks
 from scanloom.stages.clean.tiles import brick_indices
@@ -61,7 +62,16 @@ class Settings(BaseModel):
 
 
 def clean(settings: Settings, rays: Parts[Rays]) -> Iterator[Part[Cleared]]:
-    """Verdicts on the voxels of one tile for each session that passed it, the latest first."""
+    """Verdicts on the voxels of one tile for each session that passed it, the latest first.
+
+    Raises
+    ------
+    StageError : no ray crosses the tile.
+    """
+    if not len(rays):
+        raise StageError(
+            "no ray crosses this tile", next_step="run rays first; it names the tiles that are seen"
+        )
     order, where = _latest_first(rays), rays.coordinates()[0]["tile"]
     bricks = all_bricks(rays)
     later = np.zeros((2, len(bricks), BRICK_VOXELS), np.uint32)

@@ -41,6 +41,9 @@ CONTENT_WITH_NOTHING = {
     "places",
     "sensors",
     "windows",
+    "objects",
+    "rays",
+    "relabel",
 }
 """May answer emptiness with an empty product (no truth, no windows, no tiles, no loops) instead of an error."""
 
