@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.objects.filter import LENGTH, WIDTH, YAW, X, Y
 from scanloom.stages.objects.virtual_scan import VirtualScan, said_of
 
 F4 = NDArray[np.float32]
@@ -88,7 +89,10 @@ def without_background(
         if m < 0 or row_then[m] < 0:
             continue
         x, y, z = band[n, 0] + origin[0], band[n, 1] + origin[1], band[n, 2] + origin[2]
-        if _outside(x, y, state[m, 0], state[m, 1], state[m, 20], state[m, 22], state[m, 23]) < GROWTH_M:
+        if (
+            _outside(x, y, state[m, X], state[m, Y], state[m, YAW], state[m, LENGTH], state[m, WIDTH])
+            < GROWTH_M
+        ):
             continue
         box = boxes_then[row_then[m]]
         if _outside(x, y, box[0], box[1], box[2], box[3], box[4]) < GROWTH_M:

@@ -43,7 +43,7 @@ SHARP_M = 0.4
 """Ends seen less sharply do not tell the size."""
 SURE, GROWTH, LARGE_GROWTH = 5.0, 0.005, 0.03
 """A size that was seen so often grows by no more than this share from one scan to the next; a large one by the other."""
-LARGE_M = 1.3
+LARGE_M = 2.4
 GATE = 25.0
 """A measurement farther off, in squared standard deviations, is of something else."""
 MOVING_M_S, SURE_M_S = 2.0, 1.5
@@ -163,7 +163,7 @@ def _along(row: F8, axis: int, here: float, sides: F8, spread: F8) -> tuple[floa
     size, known = row[LENGTH + axis], row[LENGTH_KNOWN + axis]
     whole = np.isfinite(s_low) and np.isfinite(s_high)
     seen = high - low
-    growth = 1.0 + (LARGE_GROWTH if min(row[LENGTH], row[WIDTH]) > LARGE_M else GROWTH)
+    growth = 1.0 + (LARGE_GROWTH if max(row[LENGTH], row[WIDTH]) > LARGE_M else GROWTH)
     if whole and max(s_low, s_high) < SHARP_M:
         blend = 1.0 / min(known + 1.0, 10.0) if seen < size or known == 0.0 else 0.5
         new = size + blend * (seen - size)
@@ -240,73 +240,3 @@ def _correct(row: F8, seen: F8) -> bool:
     C -= gain @ np.ascontiguousarray(C[:2, :])
     row[P : P + 16] = (0.5 * (C + C.T)).ravel()
     return True
-
-
-MERGE_GAP_M = 0.7
-MERGE_M_S, MERGE_SURE_M_S = 1.2, 1.2
-MERGE_SLOW_M_S = 2.0
-MERGE_HITS = 4.0
-
-
-@kernel
-def same(a: F8, b: F8, longest: float, widest: float) -> bool:
-    """Whether two tracks are parts of one thing: side by side at one speed, and together no larger than things are."""
-    if a[HITS] < MERGE_HITS or b[HITS] < MERGE_HITS:
-        return False
-    if max(a[P + 10] + a[P + 15], b[P + 10] + b[P + 15]) > MERGE_SURE_M_S**2:
-        return False
-    if np.hypot(a[VX] - b[VX], a[VY] - b[VY]) > MERGE_M_S:
-        return False
-    small = max(a[LENGTH], a[WIDTH], b[LENGTH], b[WIDTH]) <= SMALL_M
-    if np.hypot(a[VX], a[VY]) < (1.0 if not small else 1.0 + MERGE_SLOW_M_S):
-        return False
-    if np.hypot(a[X] - b[X], a[Y] - b[Y]) > 0.5 * (longest + max(b[LENGTH], b[WIDTH])):
-        return False
-    own, other = _reach(a, a), _reach(b, a)
-    gap = max(max(own[0], other[0]) - min(own[1], other[1]), max(own[2], other[2]) - min(own[3], other[3]))
-    along = max(own[1], other[1]) - min(own[0], other[0])
-    across = max(own[3], other[3]) - min(own[2], other[2])
-    return bool(gap < MERGE_GAP_M and max(along, across) < longest and min(along, across) < widest)
-
-
-@kernel
-def _reach(row: F8, frame: F8) -> F8:
-    """Lowest and highest u and v (4,) of a box around the middle of another, along the axes of that."""
-    turn = row[YAW] - frame[YAW]
-    c, s = abs(np.cos(turn)), abs(np.sin(turn))
-    half_u = 0.5 * (c * row[LENGTH] + s * row[WIDTH])
-    half_v = 0.5 * (s * row[LENGTH] + c * row[WIDTH])
-    dx, dy = row[X] - frame[X], row[Y] - frame[Y]
-    u = np.cos(frame[YAW]) * dx + np.sin(frame[YAW]) * dy
-    v = np.cos(frame[YAW]) * dy - np.sin(frame[YAW]) * dx
-    return np.array([u - half_u, u + half_u, v - half_v, v + half_v])
-
-
-@kernel
-def join(a: F8, b: F8) -> None:
-    """Let the first track take in the box of the second."""
-    own, other = _reach(a, a), _reach(b, a)
-    sides = np.array([
-        min(own[0], other[0]), max(own[1], other[1]), min(own[2], other[2]), max(own[3], other[3])
-    ])  # fmt: skip
-    u, v = 0.5 * (sides[0] + sides[1]), 0.5 * (sides[2] + sides[3])
-    c, s = np.cos(a[YAW]), np.sin(a[YAW])
-    a[X] += c * u - s * v
-    a[Y] += s * u + c * v
-    a[LENGTH], a[WIDTH] = sides[1] - sides[0], sides[3] - sides[2]
-    a[LENGTH_KNOWN], a[WIDTH_KNOWN] = 1.0, 1.0
-    a[HEIGHT] = max(a[HEIGHT], b[HEIGHT])
-    a[P] += 0.3
-    a[P + 5] += 0.3
-
-
-@kernel
-def merged(state: F8, longest: float, widest: float) -> NDArray[np.bool_]:
-    """Join tracks that are parts of one thing into the older ones, in place; returns which remain (m,)."""
-    remain = np.ones(len(state), np.bool_)
-    for i in range(len(state)):
-        for k in range(i + 1, len(state)):
-            if remain[i] and remain[k] and same(state[i], state[k], longest, widest):
-                join(state[i], state[k])
-                remain[k] = False
-    return remain

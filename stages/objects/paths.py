@@ -29,7 +29,9 @@ LEAST_THROUGH, LEAST_SHARE = 3, 0.08
 """So many places, and so large a share of the points, must be seen to be empty in a scan to say that it moves."""
 UPRIGHT_M = 0.4
 """Things stand upright: rings of the sensor on the ground, which run along with the vehicle, do not."""
-SIZE_QUANTILE = 0.7
+SIZE_QUANTILE, SMALL_QUANTILE = 0.7, 0.25
+WIDEST_M, NARROWEST_M, VEHICLE_M = 2.9, 1.6, 2.6
+"""Vehicles, which are longer than the last, are at most and at least so wide."""
 STEADY_ROWS = 10
 """Places are averaged over so many scans before it is asked how far they are apart: what wanders about does not move."""
 TOP_MARGIN_M = 0.1
@@ -63,6 +65,8 @@ def object_path(settings: Settings, history: History, scan_index: NDArray[np.int
     if np.count_nonzero(seen[:, SEEN + kalman.UPRIGHT] >= UPRIGHT_M) < settings.min_scans:
         return None
     size = _final_size(seen)
+    if min(size[:2]) > WIDEST_M:
+        return None
     first, last = np.searchsorted(scan_index, [history.scans[0], history.scans[-1]])
     rows = np.arange(first, last + 1)
     place = np.searchsorted(scan_index, history.scans) - first
@@ -128,10 +132,23 @@ def _upright(rows: F8) -> F8:
 
 
 def _final_size(rows: F8) -> F8:
-    """Length, width and height of the box as the track knew them in the end."""
-    return np.array(
-        [rows[-1, kalman.LENGTH], rows[-1, kalman.WIDTH], rows[:, kalman.HEIGHT].max() + TOP_MARGIN_M]
-    )
+    """Length, width and height of the box as the track knew them; what is wider than vehicles are took in what it passed,
+    and is as large as it was without."""
+    sides = _sides(rows, SIZE_QUANTILE)
+    if min(sides) > WIDEST_M:
+        sides = _sides(rows, SMALL_QUANTILE)
+    if max(sides) > VEHICLE_M:
+        shorter = int(sides[1] < sides[0])
+        sides[shorter] = max(sides[shorter], NARROWEST_M)
+    return np.array([*sides, rows[:, kalman.HEIGHT].max() + TOP_MARGIN_M])
+
+
+def _sides(rows: F8, quantile: float) -> list[float]:
+    sides = []
+    for size, known in ((kalman.LENGTH, kalman.LENGTH_KNOWN), (kalman.WIDTH, kalman.WIDTH_KNOWN)):
+        seen = rows[rows[:, known] >= 2.0, size]
+        sides.append(float(np.quantile(seen, quantile) if len(seen) >= 3 else rows[-1, size]))
+    return sides
 
 
 def _measured(rows: F8, size: F8, place: NDArray[np.int64], count: int) -> tuple[F8, F8]:

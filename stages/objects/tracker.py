@@ -15,6 +15,7 @@ from scanloom.stages.objects import filter as kalman
 from scanloom.stages.objects.association import NOBODY, in_tracks, spread_over_clusters
 from scanloom.stages.objects.clusters import clusters, extents, grouped
 from scanloom.stages.objects.evidence import Reference, arrived, asked, sampled, without_background
+from scanloom.stages.objects.merging import merged
 from scanloom.stages.objects.settings import Settings
 from scanloom.stages.objects.virtual_scan import VirtualScan
 
@@ -222,7 +223,7 @@ class Tracker:
 
     def _merge(self) -> None:
         """Parts of one thing that were taken for several become one track, the oldest of them."""
-        remain = kalman.merged(self._state, self._settings.longest_m, self._settings.widest_m)
+        remain = merged(self._state, self._settings.longest_m, self._settings.widest_m)
         if not remain.all():
             for m in np.flatnonzero(~remain):
                 del self._histories[self._ids[m]]
