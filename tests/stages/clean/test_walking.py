@@ -1,0 +1,178 @@
+"""Rays and returns in the field of voxels, against sampling along the ray."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scanloom.schemas.scans import PointClass
+from scanloom.stages.clean.field import (
+    AFTER,
+    BEFORE,
+    BETWEEN,
+    BLOCKED,
+    FIRST_BRICKS,
+    HITS,
+    PASSED,
+    SATURATED,
+    TRACKED,
+    Field,
+    brick_key,
+    inner,
+    row_of,
+)
+from scanloom.stages.clean.incidence import clear_ranges, fill, new_image
+from scanloom.stages.clean.tiles import brick_indices, bricks_by_tile
+from scanloom.stages.clean.walking import NEAREST_M, mark_hits, walk
+from scanloom.stages.geometry.se3 import F8, pose, so3_exp
+from scanloom.stages.geometry.voxels import pack
+
+VOXEL_M, REACH_M = 0.2, 60.0
+ORIGIN = pose(so3_exp([0.02, -0.03, 0.7]), [3.07, -5.11, 1.93])
+
+
+def columns(points: F8) -> tuple[np.ndarray, ...]:
+    return tuple(np.ascontiguousarray(c) for c in points.astype(np.float32).T)
+
+
+def marked(field: Field, points: F8, bin_: int, T: F8 = ORIGIN, *, moved: bool = False) -> None:
+    n = len(points)
+    classes = np.full(n, PointClass.STATIC, np.uint8)
+    done = mark_hits(
+        *columns(points), classes, np.full(n, moved), T, bin_, REACH_M, VOXEL_M, 0,
+        field.keys, field.rows, field.order, field.count, field.voxels,
+    )  # fmt: skip
+    assert done == n
+
+
+def walked(field: Field, points: F8, clear_m: np.ndarray, bin_: int, T: F8 = ORIGIN) -> int:
+    return walk(
+        *columns(points), clear_m.astype(np.float32), T, bin_, REACH_M, VOXEL_M, 0,
+        field.keys, field.rows, field.order, field.count, field.voxels,
+    )  # fmt: skip
+
+
+def count(field: Field, layer: int, voxel: np.ndarray) -> int:
+    i, j, k = (int(v) for v in voxel)
+    row = row_of(field.keys, field.rows, brick_key(i, j, k))
+    return int(field.voxels[row, layer, inner(i, j, k)]) if row >= 0 else 0
+
+
+def voxel_of(point: F8, T: F8 = ORIGIN) -> np.ndarray:
+    return np.floor((T[:3, :3] @ point + T[:3, 3]) / VOXEL_M).astype(int)
+
+
+@pytest.mark.parametrize(
+    "direction", [[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0], [3.0, -2.0, 0.5], [-1.0, 1.0, -1.0]]
+)
+def test_a_ray_passes_the_voxels_along_it_and_no_others(direction: list[float]) -> None:
+    way = np.array(direction) / np.linalg.norm(direction)
+    point, field = 20.0 * way, Field()
+    assert walked(field, point[None], np.array([15.0]), 1) == 1
+    samples = np.arange(NEAREST_M + 1e-4, 15.0, 0.003)
+    sampled = {tuple(voxel_of(s * way)) for s in samples}
+    assert all(count(field, BEFORE, np.array(v)) == 1 for v in sampled)
+    total = int(field.voxels[: len(field.bricks), BEFORE].sum())
+    assert len(sampled) <= total <= 1.05 * len(sampled) + 2
+
+
+def test_returns_block_their_surroundings_for_their_bin_only() -> None:
+    field, wall = Field(), np.array([[10.0, 0.0, 0.0]])
+    marked(field, wall, 1)
+    at = voxel_of(wall[0])
+    assert count(field, HITS, at) == 1
+    around = [at + np.array([a, b, c]) for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 0, 1)]
+    assert all(count(field, BLOCKED, v) == 1 for v in around)
+    beyond = np.array([[20.0, 0.0, 0.0]])
+    walked(field, beyond, np.array([19.0]), 1)
+    assert count(field, PASSED, at) == 0
+    walked(field, beyond, np.array([19.0]), 2)
+    assert count(field, AFTER, at) == 1
+    marked(field, wall, 3, moved=True)
+    assert (count(field, BETWEEN, at), count(field, AFTER, at), count(field, HITS, at)) == (1, 0, 2)
+    assert count(field, TRACKED, at) == 1
+
+
+def test_several_rays_of_a_bin_count_once() -> None:
+    field, beyond = Field(), np.array([[20.0, 0.0, 0.0]] * 5)
+    walked(field, beyond, np.full(5, 15.0), 1)
+    assert count(field, BEFORE, voxel_of(np.array([10.0, 0, 0]))) == 1
+
+
+def test_a_ray_that_is_nowhere_clear_says_nothing() -> None:
+    field = Field()
+    assert walked(field, np.array([[20.0, 0, 0], [5.0, 0, 0]]), np.array([NEAREST_M, np.nan]), 1) == 2
+    assert len(field.bricks) == 0
+
+
+def test_the_field_grows_when_it_is_full() -> None:
+    field = Field()
+    angle = np.linspace(-np.pi, np.pi, 3000, endpoint=False)
+    points = 59.0 * np.column_stack((np.cos(angle), np.sin(angle), 0.4 * np.sin(9 * angle)))
+    clear, done = np.full(len(points), 58.0), 0
+    while True:
+        done = walk(
+            *columns(points), clear.astype(np.float32), ORIGIN, 1, REACH_M, VOXEL_M, done,
+            field.keys, field.rows, field.order, field.count, field.voxels,
+        )  # fmt: skip
+        if done == len(points):
+            break
+        assert len(field.bricks) == len(field.order)
+        field.grow()
+    assert len(field.bricks) > FIRST_BRICKS
+    roomy = Field()
+    for _ in range(4):
+        roomy.grow()
+    assert walked(roomy, points, clear, 1) == len(points)
+    a, b = np.argsort(field.bricks), np.argsort(roomy.bricks)
+    assert (field.bricks[a] == roomy.bricks[b]).all()
+    assert (field.voxels[a, BEFORE] == roomy.voxels[b, BEFORE]).all()
+
+
+def test_stamps_come_round_after_their_last() -> None:
+    field, beyond = Field(), np.array([[20.0, 0.0, 0.0]])
+    stamps = [field.stamp(n) for n in range(1, SATURATED + 3)]
+    assert stamps[:2] == [1, 2]
+    assert stamps[SATURATED - 1 :] == [SATURATED, 1, 2]
+    walked(field, beyond, np.array([15.0]), field.stamp(1))
+    walked(field, beyond, np.array([15.0]), field.stamp(SATURATED + 1))
+    assert count(field, BEFORE, voxel_of(np.array([10.0, 0, 0]))) == 2
+
+
+def test_grazing_rays_end_early_and_steep_ones_late() -> None:
+    x = np.linspace(5.0, 40.0, 400)
+    ground = np.column_stack((x, np.zeros_like(x), np.full_like(x, -1.8)))
+    image = new_image()
+    cell = fill(*columns(ground), image)
+    clear = clear_ranges(*columns(ground), cell, image, 0.3)
+    r = np.linalg.norm(ground, axis=1)
+    kept = np.array(sorted(set(image[image >= 0].tolist())))[2:-2]
+    expected = 0.3 * r[kept] / 1.8  # clearance over the sine of the angle to level ground
+    assert (np.abs((r - clear)[kept] - expected) < 0.25 * expected + 0.05).mean() > 0.95
+    alone = np.array([[10.0, 0.0, 0.0]])
+    assert clear_ranges(*columns(alone), fill(*columns(alone), image), image, 0.3)[0] == pytest.approx(9.7)
+
+
+def test_points_outside_the_image_say_nothing() -> None:
+    up, image = np.array([[0.0, 0.0, 9.0], [np.nan, 0, 0], [0.0, 0, 0]]), new_image()
+    cell = fill(*columns(up), image)
+    assert cell.tolist() == [-1, -1, -1]
+    assert clear_ranges(*columns(up), cell, image, 0.3).tolist() == [0.0, 0.0, 0.0]
+
+
+def test_every_brick_goes_to_the_tiles_it_reaches_into() -> None:
+    rng = np.random.default_rng(0)
+    bricks = np.array([pack(*(int(v) for v in ijk)) for ijk in rng.integers(-40, 40, (500, 3))], np.int64)
+    bricks = np.unique(bricks)
+    low = brick_indices(bricks) * 1.6
+    found = dict(bricks_by_tile(bricks, 1.6, 20.0, 0.2))
+    for n in range(len(bricks)):
+        wanted = {
+            f"{a}_{b}"
+            for a in range(-5, 5)
+            for b in range(-5, 5)
+            if low[n, 0] < 20.0 * (a + 1) + 0.2 and low[n, 0] + 1.6 > 20.0 * a - 0.2
+            and low[n, 1] < 20.0 * (b + 1) + 0.2 and low[n, 1] + 1.6 > 20.0 * b - 0.2
+        }  # fmt: skip
+        assert {name for name, rows in found.items() if n in rows} == wanted
+    assert all((np.diff(bricks[rows]) > 0).all() for rows in found.values())
