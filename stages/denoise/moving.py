@@ -257,7 +257,7 @@ def _look(
 
 @kernel
 def _counted(
-    x: F4, y: F4, point: I4, thing: I4, count: int, free: B1, denied: B1, told: B1
+    x: F4, y: F4, point: I4, thing: I4, count: Int, free: B1, denied: B1, told: B1
 ) -> tuple[I4, I4, I4, I4, F4]:
     """Of each thing (count,): points, how many of them are free, denied, told; and the diagonal of its outline, m."""
     sums = np.zeros((4, count), np.int32)

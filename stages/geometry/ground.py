@@ -37,6 +37,8 @@ EDGE_CELLS = 2
 """So many cells must continue what lies below an edge."""
 KERB_M = 2.0
 FIT_GATES_M = (0.5, 0.3, 0.2, 0.15)
+FLOORED_SECTORS = 60
+"""A floor is seen in a third of all directions."""
 FOOT_M = 0.05
 """Under something that stands on it the ground ends here above its height: what the noise of a range explains."""
 
@@ -51,11 +53,15 @@ def ground_mask(x_m: F4, y_m: F4, z_m: F4, usable: B1, R_level_lidar: F8, height
     R_level_lidar : (3, 3) turns the LiDAR's axes into the vehicle's, z up.
 
     Feet belong to what stands on them: with other points right above it a point is ground only within FOOT_M.
-    Without ground around the sensor nothing is ground.
+    Without ground around the sensor nothing is ground. A sensor that hangs upside down without saying so has its ground
+    above it.
     """
     cell, forward, left, up = levelled(x_m, y_m, z_m, usable, R_level_lidar)
     lowest, highest = extent(cell, up)
     plane = seed_plane(lowest)
+    if hangs(lowest, highest, plane):
+        up, lowest, highest = -up, -highest, -lowest
+        plane = seed_plane(lowest)
     if plane is None:
         return np.zeros(len(x_m), np.bool_)
     height = _without_strangers(_follow(lowest, highest, plane), highest)
@@ -85,6 +91,29 @@ def seed_plane(lowest: F8) -> F8 | None:
         if np.hypot(fitted[1], fitted[2]) < STEEPEST:
             plane = fitted
     return plane
+
+
+def hangs(lowest: F8, highest: F8, plane: F8 | None) -> bool:
+    """Whether there is no ground below the sensor, whose plane (3,) was sought, but a floor all around above it."""
+    below = _floored(lowest, highest, plane)
+    if below >= FLOORED_SECTORS:
+        return False
+    above = _floored(-highest, -lowest, seed_plane(-highest))
+    return above >= FLOORED_SECTORS and above > 3 * below
+
+
+def _floored(lowest: F8, highest: F8, plane: F8 | None) -> int:
+    """Sectors in which flat cells, and more than one, lie on the plane."""
+    if plane is None:
+        return 0
+    x, y = _seed_cells()
+    near = slice(None), slice(x.shape[1])
+    low, high = lowest[near], highest[near]
+    with np.errstate(invalid="ignore"):
+        on = (high - low < FLAT_M) & (
+            np.abs(low - (plane[0] + plane[1] * x + plane[2] * y)) < FIT_GATES_M[-1]
+        )
+    return int(np.count_nonzero(on.sum(axis=1) > 1))
 
 
 @cache
