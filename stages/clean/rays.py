@@ -1,7 +1,8 @@
 """Rays: what the scans of one chunk say of the free space around them, voxel by voxel and tile by tile.
 
 Scans are taken together in bins of a fraction of a second. Each return marks its voxel and blocks those around it for its
-bin; then every ray is walked from the sensor to well before its return, and what it passes unblocked was free in this bin.
+bin; then the rays of a scan in its middle are walked from the sensor to well before their returns, and what they pass unblocked
+was free in this bin.
 Poses are those of the finished map. Source: methods 1.5.1 and 1.5.2 (occupancy by rays), with two differences: bins instead
 of log-odds, so that what stood for long and then left is told from what is half transparent; and the blocked neighbourhood,
 which takes up errors of poses and ranges.
@@ -42,6 +43,12 @@ class Settings(BaseModel):
         50.0, ge=8.0, le=1000.0, description="edge of a tile that is decided as one, m"
     )
     bin_s: float = Field(0.3, ge=0.0, le=10.0, description="scans within this time speak as one, s")
+    walked_scans: int = Field(
+        1,
+        ge=1,
+        le=100,
+        description="scans of a bin whose rays are followed, number; neighbouring scans see nearly the same",
+    )
     reach_m: float = Field(60.0, ge=5.0, le=300.0, description="rays say nothing beyond this range, m")
     clearance_m: float = Field(
         0.3, ge=0.0, le=5.0, description="a ray counts until it comes this close to the surface it meets, m"
@@ -94,7 +101,7 @@ def _seen(scan: DeskewedScan, label: ScanLabels, tracked: np.ndarray) -> tuple[n
 
 
 def _mark(settings: Settings, field: VoxelField, image: np.ndarray, bin_: int, placed: list[tuple]) -> None:
-    """All returns of a bin before its rays: a return of one scan blocks the rays of the others."""
+    """All returns of a bin before the rays of its middle: a return of one scan blocks the rays of the others."""
     for x, y, z, classes, moved, T in placed:
         _until_done(
             field,
@@ -102,7 +109,8 @@ def _mark(settings: Settings, field: VoxelField, image: np.ndarray, bin_: int, p
             (x, y, z, classes, moved, T, bin_, settings.reach_m, settings.voxel_size_m),
             len(x),
         )
-    for x, y, z, _, _, T in placed:
+    spare = max(len(placed) - settings.walked_scans, 0)
+    for x, y, z, _, _, T in placed[spare // 2 : len(placed) - (spare - spare // 2)]:
         clear = incidence.clear_ranges(x, y, z, incidence.fill(x, y, z, image), image, settings.clearance_m)
         _until_done(field, walk, (x, y, z, clear, T, bin_, settings.reach_m, settings.voxel_size_m), len(x))
 

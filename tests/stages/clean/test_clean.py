@@ -70,7 +70,9 @@ def test_what_left_between_two_sessions_has_changed_and_did_not_move() -> None:
     assert shares(first, classes["first"], left, PointClass.DYNAMIC)[0] < 0.002
     for name, drive in (("first", first), ("second", second)):
         assert shares(drive, classes[name], PARKED, PointClass.STATIC)[0] > 0.98
-        assert sum((c == PointClass.DYNAMIC).sum() for c in classes[name]) == 0
+        assert sum((c == PointClass.DYNAMIC).sum() for c in classes[name]) < 0.0002 * sum(
+            map(len, classes[name])
+        )
 
 
 def test_what_came_between_two_sessions_stays() -> None:
