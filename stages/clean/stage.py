@@ -40,6 +40,12 @@ class Settings(BaseModel):
     flicker: float = Field(
         0.1, ge=0.0, le=1.0, description="stood and left: free bins between hits over those outside, at most"
     )
+    arrived_bins: int = Field(
+        25,
+        ge=1,
+        le=10000,
+        description="stands: came, was met in so many bins and was never seen to be gone again",
+    )
     stands_share: float = Field(
         0.3, ge=0.0, le=1.0, description="stands: seen through at most this many times as often as met, ratio"
     )
@@ -101,10 +107,13 @@ def _evidence(bricks: np.ndarray, rays: Parts[Rays], numbers: list[int]) -> Evid
 
 
 def _own(settings: Settings, evidence: Evidence) -> U1:
+    limits = np.array(
+        [settings.seen_through, settings.left_bins, settings.flicker, settings.arrived_bins, settings.stands_share,
+         settings.stands_bins, settings.tracked_share], float,
+    )  # fmt: skip
     verdict: U1 = judge_own(
         evidence.bricks, evidence.keys, evidence.rows, evidence.hits, evidence.tracked, evidence.through,
-        evidence.between, settings.seen_through, settings.left_bins, settings.flicker, settings.stands_share,
-        settings.stands_bins, settings.tracked_share,
+        evidence.between, evidence.after, limits,
     )  # fmt: skip
     return verdict
 

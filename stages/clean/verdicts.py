@@ -9,6 +9,7 @@ from scanloom.schemas.clean import BRICK_SIDE, Standing
 from scanloom.stages.clean.evidence import I4, U2
 from scanloom.stages.clean.field import I8, brick_key, inner, row_of
 from scanloom.stages.geometry.kernels import kernel
+from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.geometry.voxels import Int, unpack
 
 U1 = NDArray[np.uint8]
@@ -17,15 +18,17 @@ STANDS, MOVED, CHANGED = int(Standing.STANDS), int(Standing.MOVED), int(Standing
 
 @kernel
 def judge_own(
-    bricks: I8, keys: I8, rows: I4, hits: U2, tracked: U2, through: U2, between: U2,
-    share: float, away_bins: int, flicker: float, stands_share: float, stands_bins: int, tracked_share: float,
-) -> U1:  # fmt: skip
+    bricks: I8, keys: I8, rows: I4, hits: U2, tracked: U2, through: U2, between: U2, after: U2, limits: F8
+) -> U1:
     """MOVED, STANDS or UNKNOWN (bricks, 512) by a session's own bins.
+
+    limits: share, away_bins, flicker, arrived_bins, stands_share, stands_bins, tracked_share.
 
     Seen through counts only where all six neighbours were seen through, too: a wall, a roof or a kerb has an inside that
     no ray ever passed. What was met there moved if it was seen through at least `share` times as often as it was met; or,
     for what stood long and then left, `away_bins` times outside of the time it was met, and next to never within (a tree
-    flickers: there, free bins lie between hits). It also moved if `tracked_share` of its hits are of what the tracker saw move.
+    flickers: there, free bins lie between hits). What came, was met in `arrived_bins` and never left again stands. It moved
+    in any case if `tracked_share` of its hits are of what the tracker saw move.
     """
     out = np.zeros(hits.shape, np.uint8)
     for n in range(len(bricks)):
@@ -34,13 +37,16 @@ def judge_own(
             if h == 0:
                 continue
             outside = v - np.int64(between[n, q])
-            often = v >= 1 and v >= share * h
-            left = outside >= away_bins and between[n, q] <= flicker * outside
-            if (tracked[n, q] > 0 and tracked[n, q] >= tracked_share * h) or (
-                (often or left) and open_around(bricks[n], q, n, keys, rows, through)
-            ):
+            often = v >= 1 and v >= limits[0] * h
+            left = outside >= limits[1] and between[n, q] <= limits[2] * outside
+            came = h >= limits[3] and after[n, q] == 0 and between[n, q] <= limits[2] * outside
+            if tracked[n, q] > 0 and tracked[n, q] >= limits[6] * h:
                 out[n, q] = MOVED
-            elif h >= stands_bins and v <= stands_share * h:
+            elif came:
+                out[n, q] = STANDS
+            elif (often or left) and open_around(bricks[n], q, n, keys, rows, through):
+                out[n, q] = MOVED
+            elif h >= limits[5] and v <= limits[4] * h:
                 out[n, q] = STANDS
     return out
 

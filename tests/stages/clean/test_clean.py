@@ -59,6 +59,19 @@ def test_a_car_that_waited_and_left_goes_wholly_and_one_that_stays_does_not() ->
     assert stays > 0.99
 
 
+def test_a_car_that_came_and_parked_stands() -> None:
+    def parking(t: float) -> np.ndarray:
+        return car(20.0 + 9.0 * max(0.0, 2.0 - t), 2.0)
+
+    drive = drive_past([*WALLS], [parking], count=150, step_m=0.05)
+    classes = finals({"a": drive})["a"]
+    rows = range(30, 150)
+    stays = [(classes[n][drive.within(n, parking(9.0))] == PointClass.STATIC).mean() for n in rows]
+    assert np.mean(stays) > 0.9
+    gone = [(classes[n][drive.within(n, parking(0.1 * n))] == PointClass.DYNAMIC).mean() for n in range(15)]
+    assert np.mean(gone) > 0.9
+
+
 def test_what_left_between_two_sessions_has_changed_and_did_not_move() -> None:
     left = car(20.0, 2.2)
     first = drive_past([*WALLS, PARKED, left], [], seed=1)
