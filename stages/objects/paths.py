@@ -27,6 +27,7 @@ HEADING_M_S = 1.0
 REST_M = 0.5
 LEAST_THROUGH, LEAST_SHARE = 3, 0.08
 """So many places, and so large a share of the points, must be seen to be empty in a scan to say that it moves."""
+MANY_SCANS = 15
 UPRIGHT_M = 0.4
 """Things stand upright: rings of the sensor on the ground, which run along with the vehicle, do not."""
 SIZE_QUANTILE, SMALL_QUANTILE = 0.7, 0.25
@@ -101,8 +102,13 @@ def _says_moving(asked: NDArray[np.int64]) -> B1:
 
 
 def _score(asked: NDArray[np.int64]) -> float:
-    through, taken, _ = asked.sum(axis=0)
-    return float(through / max(through + taken, 1))
+    """Share of places that were seen to be empty, or of scans that found most of them so where many did: a few scans in
+    which a box grew by metres ask of many places that it never left."""
+    through, taken, points = asked.T
+    says = int(_says_moving(asked).sum())
+    denies = int(((taken >= np.maximum(LEAST_THROUGH, LEAST_SHARE * points)) & (taken >= through)).sum())
+    places = through.sum() / max(through.sum() + taken.sum(), 1)
+    return float(max(places, says / max(says + denies, 1)) if says >= MANY_SCANS else places)
 
 
 def _displaced(t: F8, path: F8) -> B1:
