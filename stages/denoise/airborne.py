@@ -58,8 +58,9 @@ LOOKED_THROUGH = 6
 LIMIT = 6.0
 """A single look is trusted no more than this log-odds."""
 MOST_SHIFT, CLEAR_AIR = 1.0, 0.4
-LEAST_ODDS = -4.0
-"""Points below this after the scan's own evidence are not asked about: others cannot make up for it."""
+STEPS, LEAST_SHARE, MOST_ODDS = 6, 1e-5, 30.0
+LEAST_ODDS = -3.0
+"""Neighbouring scans are not asked about points below this, nor are their surroundings: they cannot make up for it."""
 
 
 def airborne(moment: Moment) -> B1:
@@ -72,12 +73,26 @@ def airborne(moment: Moment) -> B1:
     found = own_evidence(view)
     odds = np.full(len(scan), -LIMIT, np.float32)
     odds[drawn] = log_odds(found, drawn, weights.FIRST)
-    asked = drawn[odds[drawn] > LEAST_ODDS]
-    ask(moment, asked, found)
-    odds[asked] = log_odds(found, asked, weights.FIRST)
+    asked = drawn
+    for offsets, kind in ((NEAR, AGAIN_NEAR), (FAR, AGAIN_FAR)):
+        asked = asked[odds[asked] > LEAST_ODDS]
+        ask(moment, offsets, kind, asked, found)
+        odds[asked] = log_odds(found, asked, weights.FIRST)
     around = context(view.image.cell, view.image.point, scan.x_m, scan.y_m, scan.z_m, asked, odds)
-    last = log_odds(found, asked, weights.LAST) + weights.CONTEXT[around]
-    out[asked] = last + shift_of(last, len(drawn)) > 0.0
+    flake = log_odds(found, asked, weights.FLAKE) + weights.CONTEXT_FLAKE[around]
+    cloud = log_odds(found, asked, weights.CLOUD) + weights.CONTEXT_CLOUD[around]
+    by_flakes, by_clouds = shifts(flake, cloud, len(drawn))
+    out[asked] = np.logaddexp(flake + by_flakes, cloud + by_clouds) > 0.0
+    return out
+
+
+def met_again(moment: Moment, asked: I8) -> B1:
+    """Which of the points `asked` (m,) a neighbouring scan has a point near, too; none when no scan can be asked."""
+    found = np.zeros((len(moment.view.scan), KINDS), np.uint8)
+    out = np.zeros(len(asked), np.bool_)
+    for offsets, kind in ((NEAR, AGAIN_NEAR), (FAR, AGAIN_FAR)):
+        ask(moment, offsets, kind, asked, found)
+        out |= (found[asked, kind] >= 5) & (found[asked, kind] < NOT_ASKED)
     return out
 
 
@@ -131,30 +146,31 @@ def _bands(view: View, rows: I8) -> I8:
     return bands
 
 
-def ask(moment: Moment, asked: I8, found: U1) -> None:
-    """What neighbouring scans tell of the points `asked`: in how many of four they are met again, and seen through."""
-    scan = moment.view.scan
-    for offsets, kind in ((NEAR, AGAIN_NEAR), (FAR, AGAIN_FAR)):
-        known = moment.known(*offsets)
-        votes = np.zeros((len(asked), 2), np.uint8)
-        for view, T_scan_neighbour in known:
-            T = inverse(T_scan_neighbour).astype(np.float32)
-            image = view.image
-            _ask(scan.x_m, scan.y_m, scan.z_m, asked, T, image.range_m, image.row_of_bin, votes)
-        share = np.rint(4.0 * votes / max(len(known), 1)).astype(np.uint8)
-        found[asked, kind] = 5 * share[:, 0] + share[:, 1] if known else NOT_ASKED
+def ask(moment: Moment, offsets: tuple[int, ...], kind: int, asked: I8, found: U1) -> None:
+    """What scans at `offsets` tell of the points `asked`: in how many of four they are met again, and seen through."""
+    scan, known = moment.view.scan, moment.known(*offsets)
+    votes = np.zeros((len(asked), 2), np.uint8)
+    for view, T_scan_neighbour in known:
+        T = inverse(T_scan_neighbour).astype(np.float32)
+        _ask(scan.x_m, scan.y_m, scan.z_m, asked, T, view.image.range_m, view.image.row_of_bin, votes)
+    share = np.rint(4.0 * votes / max(len(known), 1)).astype(np.uint8)
+    found[asked, kind] = 5 * share[:, 0] + share[:, 1] if known else NOT_ASKED
 
 
-def shift_of(odds: F8, points: int) -> float:
-    """What the share of particles in this very scan adds to all log-odds; the share is found with it.
+def shifts(flake: F8, cloud: F8, points: int) -> tuple[float, float]:
+    """What the shares of flakes and of clouds in this very scan add to their log-odds; the shares are found with it.
 
-    Expectation and maximisation of a mixture's weight. In clear air not all of it counts, since particles keep to places.
+    Expectation and maximisation of a mixture's weights, solid things being the third. In clear air not all of it counts,
+    since particles keep to places.
     """
-    usual, shift = np.log(weights.PRIOR / (1.0 - weights.PRIOR)), 0.0
-    for _ in range(6):
-        share = np.clip((1.0 / (1.0 + np.exp(-(odds + shift)))).sum() / points, 1e-5, 0.5)
-        shift = float(np.log(share / (1.0 - share)) - usual)
-    return min(shift, MOST_SHIFT) if shift > 0.0 else CLEAR_AIR * shift
+    usual = np.log(weights.SHARES / (1.0 - weights.SHARES))
+    odds, shift = np.stack((flake, cloud)), np.zeros(2)
+    for _ in range(STEPS):
+        risen = np.exp(np.clip(odds + shift[:, None], -MOST_ODDS, MOST_ODDS))
+        share = np.clip((risen / (1.0 + risen.sum(axis=0))).sum(axis=1) / points, LEAST_SHARE, 0.5)
+        shift = np.log(share / (1.0 - share)) - usual
+    capped = np.where(shift > 0.0, np.minimum(shift, MOST_SHIFT), CLEAR_AIR * shift)
+    return float(capped[0]), float(capped[1])
 
 
 @kernel

@@ -1,6 +1,6 @@
 """Denoise: a class for every point. Nothing is deleted here; what is not scenery is named.
 
-Own vehicle, out of range, standing alone, ground; then, by the scans shortly before and after, what is in the air and
+Own vehicle, out of range, ground, standing alone without being met again; then, by the scans shortly before and after, what is in the air and
 what moves; the rest is static until a later stage knows better.
 Source: methods 1.5 (Ren et al. 2021, steps c and d) and 2.3.1 for the ground.
 """
@@ -16,7 +16,7 @@ from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
-from scanloom.stages.denoise.airborne import airborne
+from scanloom.stages.denoise.airborne import airborne, met_again
 from scanloom.stages.denoise.bounds import bounded
 from scanloom.stages.denoise.moving import Movers
 from scanloom.stages.denoise.settings import Settings
@@ -62,6 +62,8 @@ def _labelled(settings: Settings, around: Iterator[Moment]) -> Iterator[ScanLabe
     movers = Movers()
     for moment in around:
         scan, classes = moment.view.scan, moment.view.classes.copy()
+        lonely = np.flatnonzero(classes == PointClass.OUTLIER)
+        classes[lonely[met_again(moment, lonely)]] = PointClass.STATIC
         if settings.particles:
             classes[airborne(moment)] = PointClass.AIRBORNE
         if settings.moving:
