@@ -17,6 +17,7 @@ from scanloom.pipeline.run import Result
 from scanloom.schemas.changes import ChangeFiles, Changes
 from scanloom.schemas.errors import StoreError, UsageError
 from scanloom.schemas.evaluation import Metrics, PictureFiles
+from scanloom.schemas.objects import ObjectTracks
 from scanloom.schemas.session import Session
 from scanloom.schemas.tiles import MapFiles, Tile, TileFiles, TileIndex
 from scanloom.schemas.trajectory import Poses
@@ -144,6 +145,9 @@ def _items(result: Result) -> Iterable[Item]:
         name = trajectory_file(dict(coordinate)["session"], len(poses))
         yield Item(name, path)
         yield Item(f"{name.removesuffix('.parquet')}.tum", trajectory_tum(Poses.open(path)))
+    tracks = result.files(ObjectTracks)
+    for coordinate, path in tracks:
+        yield Item(objects_file(dict(coordinate)["session"], len(tracks)), path)
     for _, path in result.files(Changes):
         if Changes.open(path).sessions:
             yield Item("changes.parquet", path)
@@ -152,6 +156,11 @@ def _items(result: Result) -> Iterable[Item]:
             yield Item("changes.ply", path / "changes.ply")
     for _, path in result.files(PictureFiles):
         yield Item("preview.png", path / "preview.png")
+
+
+def objects_file(session: str, sessions: int) -> str:
+    """Where a map of so many sessions keeps the boxes of what moved in this one."""
+    return "objects.parquet" if sessions == 1 else f"objects/{session}.parquet"
 
 
 def trajectory_file(session: str, sessions: int) -> str:

@@ -37,6 +37,8 @@ def test_everything_is_delivered(mapped: Path) -> None:
     out = mapped / "out"
     for name in (
         "map.ply",
+        "removed.ply",
+        "objects.parquet",
         "trajectory.parquet",
         "trajectory.tum",
         "metrics.json",
