@@ -49,6 +49,8 @@ SAMPLED = 4
 LEAST_IN_BAND = 100
 BRIGHT, BRIGHTER = 0.8, 12
 """Quantile of the intensities of solid things that strengths are relative to, and the bin that no particle reaches."""
+DIMMEST = 0.7
+"""A range whose solid things seem dimmer than this share of those at the brightest range is full of dust."""
 COMMON, COMMON_BINS = (0.03, 0.08, 0.15, 0.25), (4, 7, 9, 11)
 """An intensity that this share of solid points stay below is at least in this bin."""
 ROUNDED, SAYS_NOTHING = 0.01, 9
@@ -126,14 +128,18 @@ def strength_edges(view: View, some: I8, found: U1) -> F8 | None:
         return None
     faintest = intensity.min()
     rounded = float(np.mean(intensity == faintest)) > ROUNDED
-    out = np.empty((len(RANGE_EDGES_M) + 1, len(STRENGTH_EDGES)))
-    for k in range(len(out)):
+    bright = np.full(len(RANGE_EDGES_M) + 1, float(np.quantile(intensity, BRIGHT)))
+    for k in range(len(bright)):
         inside = intensity[band == k]
-        common = np.quantile(inside if len(inside) >= LEAST_IN_BAND else intensity, (*COMMON, BRIGHT))
-        if common[-1] <= 0.0:
-            return None
-        out[k] = STRENGTH_EDGES * common[-1]
-        for at, limit in zip(COMMON_BINS, common, strict=False):
+        if len(inside) >= LEAST_IN_BAND:
+            bright[k] = np.quantile(inside, BRIGHT)
+    bright = np.maximum(bright, DIMMEST * bright.max())
+    if bright.max() <= 0.0:
+        return None
+    common = np.quantile(intensity, COMMON)
+    out: F8 = bright[:, None] * STRENGTH_EDGES
+    for k in range(len(out)):
+        for at, limit in zip(COMMON_BINS, common, strict=True):
             out[k, :at] = np.minimum(out[k, :at], limit)
         if rounded:
             out[k, :SAYS_NOTHING] = np.minimum(out[k, :SAYS_NOTHING], faintest)
