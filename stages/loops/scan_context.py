@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.stages.geometry.kernels import kernel
-from scanloom.stages.geometry.voxels import Int
 from scanloom.stages.geometry.range_image import turn_of
+from scanloom.stages.geometry.voxels import Int
 
 F4 = NDArray[np.float32]
 I2 = NDArray[np.int16]

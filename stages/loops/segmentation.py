@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from scanloom.stages.geometry.kernels import kernel
+from scanloom.stages.geometry.range_image import F4, I4, RangeImage
 from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.geometry.voxels import Int
-from scanloom.stages.geometry.range_image import F4, I4, RangeImage
 
 B1 = NDArray[np.bool_]
 I8 = NDArray[np.int64]
