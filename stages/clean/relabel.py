@@ -140,6 +140,7 @@ def final(settings: Settings, scan: DeskewedScan, classes: U1, known: _Map) -> U
         np.uint8
     )
     near, around = (known.moving.points(scan, m) for m in (settings.box_margin_m, settings.wide_box_margin_m))
+    out[near & np.isin(out, RESTORED)] = DYNAMIC
     judged = np.isin(out, JUDGED)
     said[judged & (near | (around & (said != Standing.STANDS)))] = Standing.MOVED
     said[out == PointClass.DYNAMIC] = Standing.MOVED
