@@ -7,7 +7,19 @@ from numpy.typing import NDArray
 
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8
-from scanloom.stages.objects.filter import HITS, LENGTH, LENGTH_KNOWN, SURE, WIDTH, WIDTH_KNOWN, YAW, P, X, Y
+from scanloom.stages.objects.filter import (
+    HITS,
+    LENGTH,
+    LENGTH_KNOWN,
+    PROVEN,
+    SURE,
+    WIDTH,
+    WIDTH_KNOWN,
+    YAW,
+    P,
+    X,
+    Y,
+)
 
 F4 = NDArray[np.float32]
 I4 = NDArray[np.int32]
@@ -61,9 +73,11 @@ def _paint(raster: I4, nearest: F4, m: int, row: F8, origin: F8) -> None:
 
 
 @kernel
-def spread_over_clusters(owner: I4, label: I4, count: int, band: F4, state: F8, origin: F8) -> tuple[I4, I4]:
-    """Give the rest of a cluster to the one track that has much of it. Returns the owners (n,), and of every cluster
-    (count,) its track, SEVERAL, or NOBODY."""
+def spread_over_clusters(
+    owner: I4, label: I4, count: int, band: F4, state: F8, origin: F8, longest: float
+) -> tuple[I4, I4]:
+    """Give the rest of a cluster to the one track that has much of it, and to a vehicle that may turn out longer what lies
+    in line with it. Returns the owners (n,), and of every cluster (count,) its track, SEVERAL, or NOBODY."""
     first = np.full(count, NOBODY, np.int32)
     own, size = np.zeros(count, np.int32), np.zeros(count, np.int32)
     for n in range(len(owner)):
@@ -83,9 +97,24 @@ def spread_over_clusters(owner: I4, label: I4, count: int, band: F4, state: F8, 
     out = owner.copy()
     for n in range(len(owner)):
         c = label[n]
-        if owner[n] == NOBODY and first[c] >= 0 and fits[c] and own[c] >= OWN_SHARE * size[c]:
+        if owner[n] != NOBODY or first[c] < 0:
+            continue
+        whole = fits[c] and own[c] >= OWN_SHARE * size[c]
+        if whole or in_line(band[n], state[first[c]], origin, longest):
             out[n] = first[c]
     return out, first
+
+
+@kernel
+def in_line(point: F4, row: F8, origin: F8, longest: float) -> bool:
+    """Whether a point may be of a vehicle, proven to drive, of which both ends were not seen yet: as far out as the longest
+    vehicle would reach, and no farther to the side than it is wide."""
+    if row[PROVEN] == 0.0 or row[LENGTH_KNOWN] >= SURE:
+        return False
+    dx, dy = point[0] + origin[0] - row[X], point[1] + origin[1] - row[Y]
+    c, s = np.cos(row[YAW]), np.sin(row[YAW])
+    u, v = abs(c * dx + s * dy), abs(c * dy - s * dx)
+    return bool(u < longest - 0.5 * row[LENGTH] and v < 0.5 * row[WIDTH] + GATE_M)
 
 
 @kernel

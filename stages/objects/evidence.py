@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.objects.association import in_line
 from scanloom.stages.objects.filter import LENGTH, WIDTH, YAW, X, Y
 from scanloom.stages.objects.virtual_scan import VirtualScan, said_of
 
@@ -77,7 +78,8 @@ def asked(points: F8, box: F8, origin: F8, starts: I4, returns: F4) -> tuple[int
 
 @kernel
 def without_background(
-    owner: I4, band: F4, origin: F8, state: F8, row_then: I4, boxes_then: F8, origin_then: F8, starts: I4, returns: F4
+    owner: I4, band: F4, origin: F8, state: F8, row_then: I4, boxes_then: F8, origin_then: F8, starts: I4, returns: F4,
+    longest: float,
 ) -> None:  # fmt: skip
     """Take from the tracks, in place, the points by which they would grow into what stood there before.
 
@@ -93,6 +95,8 @@ def without_background(
             _outside(x, y, state[m, X], state[m, Y], state[m, YAW], state[m, LENGTH], state[m, WIDTH])
             < GROWTH_M
         ):
+            continue
+        if in_line(band[n], state[m], origin, longest):
             continue
         box = boxes_then[row_then[m]]
         if _outside(x, y, box[0], box[1], box[2], box[3], box[4]) < GROWTH_M:

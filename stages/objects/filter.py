@@ -24,7 +24,9 @@ YAW, YAW_VAR, LENGTH, WIDTH, HEIGHT, FOOT = 20, 21, 22, 23, 24, 25
 LENGTH_KNOWN, WIDTH_KNOWN = 26, 27
 """How often both ends of it were seen."""
 HITS, MISSED_S = 28, 29
-STATE = 30
+PROVEN = 30
+"""1 once it is proven that it drove."""
+STATE = 31
 
 MEASURED_X, MEASURED_Y, R_XX, R_XY, R_YY, GROWS_U, GROWS_V, POINTS, UPRIGHT = 0, 1, 2, 3, 4, 5, 6, 7, 8
 """What an update saw: the middle of the box, its covariance, where the box grows to (1 forward, -1 back, 0 neither), how
@@ -44,6 +46,8 @@ SHARP_M = 0.4
 SURE, GROWTH, LARGE_GROWTH = 5.0, 0.005, 0.03
 """A size that was seen so often grows by no more than this share from one scan to the next; a large one by the other."""
 LARGE_M = 2.4
+PIECE, LEAST_VEHICLE = 0.8, (2.4, 1.2)
+"""What is shorter than this share of a vehicle is a piece of it, if its size is known or no vehicle is so small, m."""
 GATE = 25.0
 """A measurement farther off, in squared standard deviations, is of something else."""
 MOVING_M_S, SURE_M_S = 2.0, 1.5
@@ -164,7 +168,10 @@ def _along(row: F8, axis: int, here: float, sides: F8, spread: F8) -> tuple[floa
     whole = np.isfinite(s_low) and np.isfinite(s_high)
     seen = high - low
     growth = 1.0 + (LARGE_GROWTH if max(row[LENGTH], row[WIDTH]) > LARGE_M else GROWTH)
-    if whole and max(s_low, s_high) < SHARP_M:
+    piece = row[PROVEN] > 0.0 and seen < PIECE * size and (known >= SURE or seen < LEAST_VEHICLE[axis])
+    if piece:
+        new = size
+    elif whole and max(s_low, s_high) < SHARP_M:
         blend = 1.0 / min(known + 1.0, 10.0) if seen < size or known == 0.0 else 0.5
         new = size + blend * (seen - size)
         if known >= SURE:

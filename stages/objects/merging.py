@@ -12,7 +12,9 @@ from scanloom.stages.objects.filter import (
     HITS,
     LENGTH,
     LENGTH_KNOWN,
+    PROVEN,
     SMALL_M,
+    SURE,
     VX,
     VY,
     WIDTH,
@@ -24,6 +26,7 @@ from scanloom.stages.objects.filter import (
 )  # fmt: skip
 
 GAP_M = 0.7
+INSIDE_M, LIKE_SHARE = 0.3, 0.5
 LEAST_HITS = 4.0
 OFF_M_S, SURE_M_S = 1.2, 1.2
 """Parts of one thing drive at speeds that differ by less, and that are known so well."""
@@ -79,14 +82,40 @@ def join(a: F8, b: F8) -> None:
     a[LENGTH], a[WIDTH] = sides[1] - sides[0], sides[3] - sides[2]
     a[LENGTH_KNOWN], a[WIDTH_KNOWN] = 1.0, 1.0
     a[HEIGHT] = max(a[HEIGHT], b[HEIGHT])
+    a[PROVEN] = max(a[PROVEN], b[PROVEN])
     a[P] += 0.3
     a[P + 5] += 0.3
 
 
 @kernel
+def part_of(b: F8, a: F8, longest: float) -> bool:
+    """Whether a track is a piece of a vehicle that is proven to drive: in its box, or next to the end of it that was not
+    seen yet and about as wide."""
+    if a[PROVEN] == 0.0 or b[PROVEN] > 0.0 or np.hypot(a[X] - b[X], a[Y] - b[Y]) > longest:
+        return False
+    r = _reach(b, a)
+    half, side = 0.5 * a[LENGTH], 0.5 * a[WIDTH]
+    small = max(b[LENGTH], b[WIDTH]) <= SMALL_M
+    margin = 0.0 if small else INSIDE_M
+    if r[2] < -side - margin or r[3] > side + margin:
+        return False
+    if r[0] >= -half - margin and r[1] <= half + margin:
+        return True
+    beyond = max(r[0] - half, -half - r[1])
+    open_ended = a[LENGTH_KNOWN] < SURE and r[3] - r[2] >= LIKE_SHARE * a[WIDTH]
+    return bool(open_ended and beyond < GAP_M and max(r[1], half) - min(r[0], -half) < longest)
+
+
+@kernel
 def merged(state: F8, longest: float, widest: float) -> NDArray[np.bool_]:
-    """Join tracks that are parts of one thing into the older ones, in place; returns which remain (m,)."""
+    """Join tracks that are parts of one thing into the older ones, in place, and drop pieces of proven vehicles; returns
+    which remain (m,)."""
     remain = np.ones(len(state), np.bool_)
+    for i in range(len(state)):
+        if state[i, PROVEN] > 0.0:
+            for k in range(len(state)):
+                if k != i and remain[k] and part_of(state[k], state[i], longest):
+                    remain[k] = False
     for i in range(len(state)):
         for k in range(i + 1, len(state)):
             if remain[i] and remain[k] and same(state[i], state[k], longest, widest):

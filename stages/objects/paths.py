@@ -16,6 +16,7 @@ from scanloom.schemas.objects import ObjectClass
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.objects import filter as kalman
+from scanloom.stages.objects.proof import denies_moving, says_moving
 from scanloom.stages.objects.settings import Settings
 from scanloom.stages.objects.tracker import AGES_S, MOVED_M, History
 
@@ -25,8 +26,6 @@ SEEN = kalman.STATE
 FULL_TURN = 2.0 * np.pi
 HEADING_M_S = 1.0
 REST_M = 0.5
-LEAST_THROUGH, LEAST_SHARE = 3, 0.08
-"""So many places, and so large a share of the points, must be seen to be empty in a scan to say that it moves."""
 MANY_SCANS = 15
 UPRIGHT_M = 0.4
 """Things stand upright: rings of the sensor on the ground, which run along with the vehicle, do not."""
@@ -36,6 +35,8 @@ WIDEST_M, NARROWEST_M, VEHICLE_M = 2.9, 1.6, 2.6
 STEADY_ROWS = 10
 """Places are averaged over so many scans before it is asked how far they are apart: what wanders about does not move."""
 TOP_MARGIN_M = 0.1
+CUT_M, HIGHER_M = 2.0, 0.8
+"""Points of the highest vehicles are not used: those that reach so far up are taken to be higher by the other."""
 PERSON_M, CYCLIST_M, CYCLIST_WIDTH_M, TRUCK_M = 1.1, 2.4, 1.2, 6.5
 PERSON_M_S = 3.0
 
@@ -59,7 +60,7 @@ class ObjectPath:
 
 def object_path(settings: Settings, history: History, scan_index: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> ObjectPath | None:  # fmt: skip
     """The path of a track that moved, or None; scans and their stamps are those of the odometry."""
-    moving = _says_moving(np.array(history.asked))
+    moving = says_moving(np.array(history.asked))
     if np.count_nonzero(moving) < settings.min_scans:
         return None
     seen = _upright(np.array(history.rows))
@@ -75,7 +76,7 @@ def object_path(settings: Settings, history: History, scan_index: NDArray[np.int
     measured, R = _measured(seen, size, place, len(rows))
     path, variance = smooth(t, measured, R)
     displaced = _displaced(t, path)[place]
-    score = _score(np.array(history.asked)[displaced])
+    score = 1.0 if seen[-1, kalman.PROVEN] else _score(np.array(history.asked)[displaced])
     enough = np.count_nonzero(moving & displaced) >= settings.min_scans and score >= settings.min_score
     if not enough or not _moved(settings, path, variance):
         return None
@@ -94,19 +95,11 @@ def object_path(settings: Settings, history: History, scan_index: NDArray[np.int
     )
 
 
-def _says_moving(asked: NDArray[np.int64]) -> B1:
-    """In which updates (n,) free space says that the track moves; `asked` (n, 3) as in its history."""
-    through, taken, points = asked.T
-    enough = through >= np.maximum(LEAST_THROUGH, LEAST_SHARE * points)
-    return np.asarray(enough & (through > 2 * taken))
-
-
 def _score(asked: NDArray[np.int64]) -> float:
     """Share of places that were seen to be empty, or of scans that found most of them so where many did: a few scans in
     which a box grew by metres ask of many places that it never left."""
-    through, taken, points = asked.T
-    says = int(_says_moving(asked).sum())
-    denies = int(((taken >= np.maximum(LEAST_THROUGH, LEAST_SHARE * points)) & (taken >= through)).sum())
+    through, taken, _ = asked.T
+    says, denies = int(says_moving(asked).sum()), int(denies_moving(asked).sum())
     places = through.sum() / max(through.sum() + taken.sum(), 1)
     return float(max(places, says / max(says + denies, 1)) if says >= MANY_SCANS else places)
 
@@ -146,7 +139,9 @@ def _final_size(rows: F8) -> F8:
     if max(sides) > VEHICLE_M:
         shorter = int(sides[1] < sides[0])
         sides[shorter] = max(sides[shorter], NARROWEST_M)
-    return np.array([*sides, rows[:, kalman.HEIGHT].max() + TOP_MARGIN_M])
+    top = rows[:, kalman.HEIGHT].max() + TOP_MARGIN_M
+    cut = max(sides) > VEHICLE_M and top >= CUT_M
+    return np.array([*sides, top + HIGHER_M if cut else top])
 
 
 def _sides(rows: F8, quantile: float) -> list[float]:

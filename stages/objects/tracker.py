@@ -16,6 +16,7 @@ from scanloom.stages.objects.association import NOBODY, in_tracks, spread_over_c
 from scanloom.stages.objects.clusters import clusters, extents, grouped
 from scanloom.stages.objects.evidence import Reference, arrived, asked, sampled, without_background
 from scanloom.stages.objects.merging import merged
+from scanloom.stages.objects.proof import STRETCH, proven
 from scanloom.stages.objects.settings import Settings
 from scanloom.stages.objects.virtual_scan import VirtualScan
 
@@ -75,6 +76,7 @@ class Tracker:
         seen = update_all(scan.band, starts, order, self._state, scan.origin, scan.ground, scan.starts, scan.returns, step_rad)  # fmt: skip
         self._remember(seen, scan_index)
         self._ask(scan, stamp_ns, seen, starts, order)
+        self._prove(seen)
         self._keep_reference(scan, stamp_ns, starts, order)
         self._begin(scan, owner, label, count, scan_index, step_rad)
         if scan_index % SEED_EVERY == 0:
@@ -91,7 +93,7 @@ class Tracker:
         far = self._settings.max_range_m
         label, count = clusters(scan.band, self._settings.link_m, far)
         inside = in_tracks(scan.band, self._state, scan.origin, far)
-        owner, of_cluster = spread_over_clusters(inside, label, count, scan.band, self._state, scan.origin)
+        owner, of_cluster = spread_over_clusters(inside, label, count, scan.band, self._state, scan.origin, self._settings.longest_m)  # fmt: skip
         shape = extents(scan.band, label, count)
         free = of_cluster == NOBODY
         match_free(self._state, owner, of_cluster, shape, scan.origin, self._settings.longest_m)
@@ -132,6 +134,14 @@ class Tracker:
         asked_here = self._histories[self._ids[m]].asked
         through, taken, points = asked_here[-1]
         asked_here[-1] = (through + a[0] + b[0], taken + a[1] + b[1], points + len(before) + len(now))
+
+    def _prove(self, seen: F8) -> None:
+        """Mark the tracks of which it is now proven that they drove."""
+        for m in np.flatnonzero((seen[:, kalman.POINTS] > 0) & (self._state[:, kalman.PROVEN] == 0.0)):
+            history = self._histories[self._ids[m]]
+            if history.asked[-1][0] > 0:
+                rows, asked_there = history.rows[-STRETCH:], history.asked[-STRETCH:]
+                self._state[m, kalman.PROVEN] = proven(np.array(rows), np.array(asked_there))
 
     def _of_age(self, stamp_ns: int, age_s: float) -> Reference | None:
         """The kept scan of about that age."""
@@ -176,6 +186,7 @@ class Tracker:
             return
         then = reference.scan
         moving = np.hypot(self._state[:, kalman.VX], self._state[:, kalman.VY]) > SEED_M_S
+        moving |= self._state[:, kalman.PROVEN] > 0.0
         moving &= np.minimum(self._state[:, kalman.LENGTH], self._state[:, kalman.WIDTH]) < SEED_WIDTH_M
         small = self._state[:, kalman.LENGTH] * self._state[:, kalman.WIDTH] < SEED_WITHIN_M2
         inside = in_tracks(
@@ -218,7 +229,8 @@ class Tracker:
         then = reference.scan
         row_then = np.array([reference.number.get(i, -1) for i in self._ids], np.int32)
         without_background(
-            owner, scan.band, scan.origin, self._state, row_then, reference.boxes, then.origin, then.starts, then.returns
+            owner, scan.band, scan.origin, self._state, row_then, reference.boxes, then.origin, then.starts, then.returns,
+            self._settings.longest_m,
         )  # fmt: skip
 
     def _merge(self) -> None:
