@@ -61,7 +61,7 @@ def test_a_car_that_waited_and_left_goes_wholly_and_one_that_stays_does_not() ->
 
 def test_a_car_that_came_and_parked_stands() -> None:
     def parking(t: float) -> np.ndarray:
-        return car(20.0 + 9.0 * max(0.0, 2.0 - t), 2.0)
+        return car(20.0 - 9.0 * max(0.0, 2.0 - t), 2.0)
 
     drive = drive_past([*WALLS], [parking], count=150, step_m=0.05)
     classes = finals({"a": drive})["a"]
