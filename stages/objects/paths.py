@@ -89,7 +89,7 @@ def object_path(settings: Settings, history: History, scan_index: NDArray[np.int
         yaw=yaw,
         size=size,
         speed_m_s=speed,
-        dynamic=_dynamic(settings, t, path),
+        dynamic=dynamic_rows(settings, t, path),
         kind=_kind(size, speed),
         score=score,
     )
@@ -231,9 +231,10 @@ def _yaw(seen: F8, place: NDArray[np.int64], path: F8, speed: F8, size: F8) -> F
     return yaw if forward >= 0.0 else yaw + np.pi
 
 
-def _dynamic(settings: Settings, t: F8, path: F8) -> B1:
-    """All rows but those after it came to rest for good."""
-    apart = np.hypot(*(path[:, :2] - path[-1, :2]).T)
+def dynamic_rows(settings: Settings, t: F8, path: F8) -> B1:
+    """All rows but those after it came to rest for good: where a path (n, 2 or more) of times t, s, stays to its end."""
+    rest = np.median(path[t >= t[-1] - settings.parked_s, :2], axis=0)
+    apart = np.hypot(*(path[:, :2] - rest).T)
     last = int(np.flatnonzero(apart > REST_M).max(initial=0))
     moving = np.ones(len(t), bool)
     if t[-1] - t[last] > settings.parked_s:

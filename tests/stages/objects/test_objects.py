@@ -8,6 +8,7 @@ import pytest
 from scanloom.schemas.objects import ObjectClass, ObjectTracks
 from scanloom.schemas.product import columns_of
 from scanloom.stages.objects import Settings
+from scanloom.stages.objects.paths import dynamic_rows
 from tests.stages.objects.film import CAR, PERSON, Film, box, film, straight
 from tests.worlds import GROUND_Z_M, street
 
@@ -90,6 +91,31 @@ def test_a_car_that_comes_to_rest_is_dynamic_while_it_drove_and_parked_if_it_sta
     car = main_track(film(straight(round((2.5 + stands_s) * 10)), boxes).tracks())
     assert car.dynamic[car.scan_index < 20].all()
     assert car.dynamic[car.scan_index > 32].any() != parked
+
+
+@pytest.mark.parametrize(("stands_s", "parked"), [(4.9, False), (5.2, True)])
+@pytest.mark.parametrize("last_m", [0.0, 0.4])
+def test_it_has_parked_even_if_its_last_place_is_off(stands_s: float, parked: bool, last_m: float) -> None:
+    t = np.arange(0.0, 4.0 + stands_s, 0.1)
+    x = 3.0 * np.minimum(t, 4.0)
+    x[-1] += last_m
+    dynamic = dynamic_rows(Settings(), t, np.column_stack((x, np.zeros(len(t)))))
+    assert dynamic[t < 3.8].all()
+    assert dynamic[t > 4.1].any() != parked
+
+
+@pytest.mark.parametrize("side_m", [3.2, 4.5])
+def test_a_bus_that_halts_while_we_pass_and_drives_on_is_covered_all_the_time(side_m: float) -> None:
+    def boxes(t: float) -> list[list[list[float]]]:
+        drives = min(t, 3.0) + max(t - 8.0, 0.0)
+        front, side = 38.0 - 5.0 * drives, side_m
+        return [[[front, side - 1.25, GROUND_Z_M], [front + 11.0, side + 1.25, GROUND_Z_M + 3.0]], HOUSE]
+
+    bus = film(straight(105, 3.0), boxes)
+    tracks = bus.tracks()
+    assert main_track(tracks).dynamic.all()
+    assert 10.0 < main_track(tracks).length_m[0] < 12.0
+    assert 0.95 < bus.covered(tracks, 0) <= 1.0
 
 
 @pytest.mark.parametrize("side_m", [2.4, 3.5, 6.0])
