@@ -35,8 +35,8 @@ WIDEST_M, NARROWEST_M, VEHICLE_M = 2.9, 1.6, 2.6
 STEADY_ROWS = 10
 """Places are averaged over so many scans before it is asked how far they are apart: what wanders about does not move."""
 TOP_MARGIN_M = 0.1
-CUT_M, HIGHER_M = 2.0, 0.8
-"""Points of the highest vehicles are not used: those that reach so far up are taken to be higher by the other."""
+LARGE_WIDTH_M, CUT_M, HIGHER_M = 2.1, 2.0, 0.8
+"""The highest points of lorries and buses are not used: those that reach so far up are taken to be higher by the last."""
 PERSON_M, CYCLIST_M, CYCLIST_WIDTH_M, TRUCK_M = 1.1, 2.4, 1.2, 6.5
 PERSON_M_S = 3.0
 
@@ -140,7 +140,8 @@ def _final_size(rows: F8) -> F8:
         shorter = int(sides[1] < sides[0])
         sides[shorter] = max(sides[shorter], NARROWEST_M)
     top = rows[:, kalman.HEIGHT].max() + TOP_MARGIN_M
-    cut = max(sides) > VEHICLE_M and top >= CUT_M
+    large = max(sides) > TRUCK_M or (max(sides) > VEHICLE_M and min(sides) > LARGE_WIDTH_M)
+    cut = large and top >= CUT_M
     return np.array([*sides, top + HIGHER_M if cut else top])
 
 
