@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.stages.clean.incidence import COLUMNS, ROWS
+from scanloom.stages.geometry.forest import join, root
 from scanloom.stages.geometry.kernels import kernel
 
 B1 = NDArray[np.bool_]
@@ -32,7 +33,7 @@ def clusters(x: F4, y: F4, z: F4, usable: B1, cell: I4, apart_m: float) -> I4:
             continue
         other = flat[cell[n]]
         if other >= 0 and abs(ranges[other] - ranges[n]) < apart_m:
-            _join(parent, other, n)
+            join(parent, other, n)
         if other < 0 or ranges[n] < ranges[other]:
             flat[cell[n]] = n
     for row in range(ROWS):
@@ -41,7 +42,7 @@ def clusters(x: F4, y: F4, z: F4, usable: B1, cell: I4, apart_m: float) -> I4:
                 _join_beside(parent, ranges, image, row, column, apart_m)
                 _join_above(parent, ranges, image, row, column, 1.5 * apart_m)
     for n in range(len(x)):
-        parent[n] = _root(parent, n)
+        parent[n] = root(parent, n)
     return parent
 
 
@@ -51,7 +52,7 @@ def _join_beside(parent: I4, ranges: F4, image: I4, row: int, column: int, apart
     for step in range(1, BESIDE + 1):
         other = image[row, (column + step) % COLUMNS]
         if other >= 0 and abs(ranges[other] - ranges[n]) < apart_m:
-            _join(parent, other, n)
+            join(parent, other, n)
 
 
 @kernel
@@ -61,20 +62,5 @@ def _join_above(parent: I4, ranges: F4, image: I4, row: int, column: int, apart_
         other = image[row + step, column]
         if other >= 0:
             if abs(ranges[other] - ranges[n]) < apart_m:
-                _join(parent, other, n)
+                join(parent, other, n)
             return
-
-
-@kernel
-def _root(parent: I4, n: int) -> int:
-    while parent[n] != n:
-        parent[n] = parent[parent[n]]
-        n = parent[n]
-    return n
-
-
-@kernel
-def _join(parent: I4, a: int, b: int) -> None:
-    a, b = _root(parent, a), _root(parent, b)
-    if a != b:
-        parent[max(a, b)] = min(a, b)

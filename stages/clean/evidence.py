@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.schemas.clean import BRICK_VOXELS, Rays
-from scanloom.stages.clean.field import I8, insert_all, row_of
+from scanloom.stages.clean.field import I8, brick_table, row_of
 from scanloom.stages.geometry.kernels import kernel
-from scanloom.stages.geometry.voxels import EMPTY, table_length
 
 I4 = NDArray[np.int32]
 U2 = NDArray[np.uint16]
@@ -34,11 +33,8 @@ class Evidence:
     @classmethod
     def of(cls, bricks: I8) -> Evidence:
         """Nothing yet on these bricks."""
-        keys = np.full(table_length(len(bricks)), EMPTY, np.int64)
-        rows = np.zeros(len(keys), np.int32)
-        insert_all(keys, rows, bricks)
         counts = np.zeros((5, len(bricks), BRICK_VOXELS), np.uint16)
-        return cls(bricks, keys, rows, *counts)
+        return cls(bricks, *brick_table(bricks, len(bricks)), *counts)
 
     def add(self, rays: Rays) -> None:
         """What the next chunk in time says."""
@@ -55,10 +51,9 @@ class Evidence:
         return capped
 
 
-def all_bricks(parts: Iterable[Rays]) -> I8:
-    """Keys (n,) of the bricks of any of the parts, increasing."""
-    keys = [part.brick for part in parts]
-    return np.unique(np.concatenate(keys)) if keys else np.empty(0, np.int64)
+def all_bricks(keys: Iterable[I8]) -> I8:
+    """Each of the keys of several tables once, increasing."""
+    return np.unique(np.concatenate([np.empty(0, np.int64), *keys]))
 
 
 @kernel

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from scanloom.schemas.clean import BRICK_VOXELS
 from scanloom.stages.geometry.kernels import kernel
+from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.geometry.voxels import EMPTY, Int, find_slot, pack, table_length
 
 I4 = NDArray[np.int32]
@@ -29,12 +30,7 @@ class Field:
         self.count = np.zeros(1, np.int64)
         self.order = np.empty(FIRST_BRICKS, np.int64)
         self.voxels = np.zeros((FIRST_BRICKS, LAYERS, BRICK_VOXELS), np.uint8)
-        self._index(FIRST_BRICKS)
-
-    def _index(self, bricks: int) -> None:
-        self.keys = np.full(table_length(bricks), EMPTY, np.int64)
-        self.rows = np.zeros(len(self.keys), np.int32)
-        insert_all(self.keys, self.rows, self.order[: int(self.count[0])])
+        self.keys, self.rows = brick_table(self.order[:0], FIRST_BRICKS)
 
     def grow(self) -> None:
         """Twice the room."""
@@ -43,7 +39,7 @@ class Field:
         order, voxels = np.empty(more, np.int64), np.zeros((more, *self.voxels.shape[1:]), np.uint8)
         order[:n], voxels[:n] = self.order[:n], self.voxels[:n]
         self.order, self.voxels = order, voxels
-        self._index(more)
+        self.keys, self.rows = brick_table(self.bricks, more)
 
     def stamp(self, bin_: int) -> int:
         """Stamp, 1 to 255, of a bin, counted from 1; stamps that come round again are wiped first."""
@@ -55,6 +51,14 @@ class Field:
     def bricks(self) -> I8:
         """Keys (n,) in the order in which they were met."""
         return self.order[: int(self.count[0])]
+
+
+def brick_table(bricks: I8, room: int) -> tuple[I8, I4]:
+    """Hash table (keys, rows) from each brick to its number, with room for so many."""
+    keys = np.full(table_length(max(room, 1)), EMPTY, np.int64)
+    rows = np.zeros(len(keys), np.int32)
+    insert_all(keys, rows, bricks)
+    return keys, rows
 
 
 @kernel
@@ -85,6 +89,15 @@ def row_made(keys: I8, rows: I4, order: I8, count: I8, key: Int) -> Int:
     keys[slot], rows[slot], order[n] = key, n, key
     count[0] = n + 1
     return np.int64(n)
+
+
+@kernel
+def voxel_at(x: float, y: float, z: float, T: F8, per_m: float) -> tuple[Int, Int, Int]:
+    """Indices of the voxel that holds a point, given in another frame and T (4, 4) from there to the map."""
+    i = np.int64(np.floor((T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) * per_m))
+    j = np.int64(np.floor((T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) * per_m))
+    k = np.int64(np.floor((T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]) * per_m))
+    return i, j, k
 
 
 @kernel

@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 from scanloom.schemas.clean import BRICK_VOXELS, Cleared
 from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import DeskewedScan
-from scanloom.stages.clean.field import I4, I8, brick_key, inner, insert_all, row_of
+from scanloom.stages.clean.field import I4, I8, brick_key, brick_table, inner, row_of, voxel_at
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8
-from scanloom.stages.geometry.voxels import EMPTY, table_length
 
 B1 = NDArray[np.bool_]
 F4 = NDArray[np.float32]
@@ -59,9 +58,7 @@ class Verdicts:
         bricks, row = np.unique(brick, return_inverse=True)
         self._verdict = np.zeros((len(bricks), BRICK_VOXELS), np.uint8)
         np.maximum.at(self._verdict, row, said)
-        self._keys = np.full(table_length(max(len(bricks), 1)), EMPTY, np.int64)
-        self._rows = np.zeros(len(self._keys), np.int32)
-        insert_all(self._keys, self._rows, bricks)
+        self._keys, self._rows = brick_table(bricks, len(bricks))
 
 
 @kernel
@@ -73,10 +70,7 @@ def standing(
     for n in range(len(x)):
         if not asked[n]:
             continue
-        px, py, pz = float(x[n]), float(y[n]), float(z[n])
-        i = np.int64(np.floor((T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]) * per_m))
-        j = np.int64(np.floor((T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]) * per_m))
-        k = np.int64(np.floor((T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]) * per_m))
+        i, j, k = voxel_at(float(x[n]), float(y[n]), float(z[n]), T, per_m)
         row = row_of(keys, rows, brick_key(i, j, k))
         if row >= 0:
             out[n] = verdict[row, inner(i, j, k)]

@@ -25,11 +25,12 @@ class MovingBoxes:
         first, last = np.searchsorted(self._tracks.scan_index, [scan.scan_index, scan.scan_index + 1])
         return self._tracks.take(slice(first, last)).boxes()
 
-    def points(self, scan: DeskewedScan, margin_m: float, above_m: float = 0.0) -> B1:
-        """Points (n,) of a scan within `margin_m` of such a box and at least `above_m` above its foot."""
-        boxes = self.of(scan)
-        if not len(boxes):
-            return np.zeros(len(scan), np.bool_)
-        boxes[:, [3, 7, 11]] += above_m * boxes[:, [2, 6, 10]]
-        boxes[:, 14] = np.maximum(boxes[:, 14] - above_m, 0.0)
-        return np.asarray(inside_boxes(scan.x_m, scan.y_m, scan.z_m, boxes, margin_m) >= 0)
+
+def boxed(scan: DeskewedScan, boxes: F8, margin_m: float, above_m: float = 0.0) -> B1:
+    """Points (n,) of a scan within `margin_m` of one of the boxes (m, 15) and at least `above_m` above its foot."""
+    if not len(boxes):
+        return np.zeros(len(scan), np.bool_)
+    raised = boxes.copy()
+    raised[:, [3, 7, 11]] += above_m * boxes[:, [2, 6, 10]]
+    raised[:, 14] = np.maximum(boxes[:, 14] - above_m, 0.0)
+    return np.asarray(inside_boxes(scan.x_m, scan.y_m, scan.z_m, raised, margin_m) >= 0)

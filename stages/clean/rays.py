@@ -23,7 +23,7 @@ from scanloom.schemas.trajectory import Poses
 from scanloom.stages.clean import incidence
 from scanloom.stages.clean.field import AFTER, BEFORE, BETWEEN, HITS, TRACKED
 from scanloom.stages.clean.field import Field as VoxelField
-from scanloom.stages.clean.moving import MovingBoxes
+from scanloom.stages.clean.moving import MovingBoxes, boxed
 from scanloom.stages.clean.tiles import bricks_by_tile
 from scanloom.stages.clean.walking import mark_hits, walk
 
@@ -73,7 +73,10 @@ def rays(
     for number, pairs in enumerate(_bins(deskewed, labels, settings.bin_s), start=1):
         first_ns = first_ns or pairs[0][0].reference_ns
         placed = [
-            (*_seen(scan, label, moving.points(scan, settings.tracked_margin_m)), T_of[scan.scan_index])
+            (
+                *_seen(scan, label, boxed(scan, moving.of(scan), settings.tracked_margin_m)),
+                T_of[scan.scan_index],
+            )
             for scan, label in pairs
             if scan.scan_index in T_of
         ]

@@ -2,9 +2,9 @@
 
 A point's voxel says whether what the session met there moved or has changed. Of a thing that hangs together in a scan, most
 of which moved, all moved: its wheels, which rays to the ground hardly pass, and its roof before the sky, which none passes.
-What the tracker saw drive about moved as well, wherever its box is; free space alone cannot know of a car that stood where nobody
-looked again. What denoise took for a stray, for dust or
-for something that moves and the map knows to stand is restored; its other classes (ground, own vehicle, dust) stay.
+What the tracker saw drive about moved as well, wherever its box is; free space alone cannot know of a car that stood where
+nobody looked again. What denoise took for a stray, for dust or for something that moves, and the map knows to stand, is
+restored. Own vehicle and range stay as they are, and ground, but for what of it is too high in a moving box.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from scanloom.schemas.trajectory import Poses
 from scanloom.stages.clean import incidence
 from scanloom.stages.clean.clusters import clusters
 from scanloom.stages.clean.lookup import Verdicts
-from scanloom.stages.clean.moving import MovingBoxes
+from scanloom.stages.clean.moving import MovingBoxes, boxed
 from scanloom.stages.geometry.se3 import F8
 
 VERSION = 1
@@ -139,31 +139,24 @@ def final(settings: Settings, scan: DeskewedScan, classes: U1, known: _Map) -> U
     out = np.where((said == Standing.STANDS) & np.isin(classes, RESTORED), PointClass.STATIC, classes).astype(
         np.uint8
     )
-    near, around = (known.moving.points(scan, m) for m in (settings.box_margin_m, settings.wide_box_margin_m))
+    boxes = known.moving.of(scan)
+    near, around = (boxed(scan, boxes, m) for m in (settings.box_margin_m, settings.wide_box_margin_m))
     out[near & np.isin(out, RESTORED)] = DYNAMIC
     judged = np.isin(out, JUDGED)
     said[judged & (near | (around & (said != Standing.STANDS)))] = Standing.MOVED
     said[out == PointClass.DYNAMIC] = Standing.MOVED
-    out[(out == PointClass.GROUND) & known.moving.points(scan, settings.box_margin_m, settings.foot_m)] = (
-        DYNAMIC
-    )
+    too_high = boxed(scan, boxes, settings.box_margin_m, settings.foot_m)
+    out[(out == PointClass.GROUND) & too_high] = DYNAMIC
+    cell = incidence.fill(scan.x_m, scan.y_m, scan.z_m, known.image)
     for usable, least in (
         (judged, settings.whole_share),
         (judged & (said != Standing.STANDS), settings.moved_share),
     ):
-        thing = _things(settings, scan, usable, known.image)
+        thing = clusters(scan.x_m, scan.y_m, scan.z_m, usable, cell, settings.apart_m)
         for standing, class_ in DECIDED:
             told = judged & (said == standing)
             out[told | (usable & _of_such(thing, told, settings.least_points, least))] = class_
     return out
-
-
-def _things(
-    settings: Settings, scan: DeskewedScan, usable: B1, image: NDArray[np.int32]
-) -> NDArray[np.int32]:
-    x, y, z = scan.x_m, scan.y_m, scan.z_m
-    found: NDArray[np.int32] = clusters(x, y, z, usable, incidence.fill(x, y, z, image), settings.apart_m)
-    return found
 
 
 def _of_such(thing: NDArray[np.int32], told: B1, least_points: int, least_share: float) -> B1:

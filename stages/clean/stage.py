@@ -9,6 +9,7 @@ gone through one by one. Source: methods 1.5.1 (free-space conflict).
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -78,8 +79,7 @@ def clean(settings: Settings, rays: Parts[Rays]) -> Iterator[Part[Cleared]]:
         raise StageError(
             "no ray crosses this tile", next_step="run rays first; it names the tiles that are seen"
         )
-    order, where = _latest_first(rays), rays.coordinates()[0]["tile"]
-    bricks = all_bricks(rays)
+    grid, bricks, order = _surveyed(rays)
     later = np.zeros((2, len(bricks), BRICK_VOXELS), np.uint32)
     for session, numbers in order.items():
         evidence = _evidence(bricks, rays, numbers)
@@ -87,16 +87,32 @@ def clean(settings: Settings, rays: Parts[Rays]) -> Iterator[Part[Cleared]]:
         _changed(settings, evidence, verdict, later)
         later[0] += evidence.hits
         later[1] += evidence.through
-        _only_own(bricks, verdict, where, rays[0])
-        yield Part(_cleared(evidence, verdict, rays[0]), session)
+        _only_own(grid, bricks, verdict)
+        yield Part(_cleared(grid, evidence, verdict), session)
 
 
-def _latest_first(rays: Parts[Rays]) -> dict[str, list[int]]:
-    """Numbers of the parts of each session, chunk by chunk in the order of time; the session that came last is first."""
+class _Grid(NamedTuple):
+    """Where the voxels of a tile lie."""
+
+    tile: tuple[int, int]
+    voxel_size_m: float
+    tile_size_m: float
+
+
+def _surveyed(rays: Parts[Rays]) -> tuple[_Grid, np.ndarray, dict[str, list[int]]]:
+    """The grid; the bricks of all parts; numbers of the parts of each session, chunk by chunk in the order of time, the
+    session that came last first. Each part is read once."""
+    bricks: list[np.ndarray] = []
     numbers: dict[str, list[int]] = {}
-    for n, where in enumerate(rays.coordinates()):
+    first_ns: dict[str, int] = {}
+    for n, (where, part) in enumerate(rays.items()):
+        bricks.append(part.brick)
         numbers.setdefault(where["session"], []).append(n)
-    return dict(sorted(numbers.items(), key=lambda item: (-rays[item[1][0]].first_ns, item[0])))
+        first_ns.setdefault(where["session"], part.first_ns)
+    x, y = (int(word) for word in where["tile"].split("_"))
+    latest_first = sorted(numbers, key=lambda session: (-first_ns[session], session))
+    grid = _Grid((x, y), part.voxel_size_m, part.tile_size_m)
+    return grid, all_bricks(bricks), {session: numbers[session] for session in latest_first}
 
 
 def _evidence(bricks: np.ndarray, rays: Parts[Rays], numbers: list[int]) -> Evidence:
@@ -130,21 +146,21 @@ def _capped(counts: np.ndarray) -> U2:
     return capped
 
 
-def _only_own(bricks: np.ndarray, verdict: U1, tile: str, rays: Rays) -> None:
+def _only_own(grid: _Grid, bricks: np.ndarray, verdict: U1) -> None:
     """Leave what lies in the bricks but not in the tile to its neighbours."""
-    corner = np.array([int(n) for n in tile.split("_")]) * rays.tile_size_m
     first = brick_indices(bricks)[:, :2] * BRICK_SIDE
+    cube = verdict.reshape(-1, BRICK_SIDE, BRICK_SIDE, BRICK_SIDE)
     for axis in range(2):
-        middle_m = (first[:, axis, None] + np.arange(BRICK_SIDE) + 0.5) * rays.voxel_size_m
-        beyond = (middle_m < corner[axis]) | (middle_m >= corner[axis] + rays.tile_size_m)
-        cube = verdict.reshape(-1, BRICK_SIDE, BRICK_SIDE, BRICK_SIDE)
+        corner_m = grid.tile[axis] * grid.tile_size_m
+        middle_m = (first[:, axis, None] + np.arange(BRICK_SIDE) + 0.5) * grid.voxel_size_m
+        beyond = (middle_m < corner_m) | (middle_m >= corner_m + grid.tile_size_m)
         shape = (-1, BRICK_SIDE, 1, 1) if axis == 0 else (-1, 1, BRICK_SIDE, 1)
         cube[np.broadcast_to(beyond.reshape(shape), cube.shape)] = Standing.UNKNOWN
 
 
-def _cleared(evidence: Evidence, verdict: U1, rays: Rays) -> Cleared:
+def _cleared(grid: _Grid, evidence: Evidence, verdict: U1) -> Cleared:
     told = np.flatnonzero((verdict != Standing.UNKNOWN).any(axis=1))
     return Cleared(
         brick=evidence.bricks[told], verdict=verdict[told],
-        voxel_size_m=rays.voxel_size_m, tile_size_m=rays.tile_size_m,
+        voxel_size_m=grid.voxel_size_m, tile_size_m=grid.tile_size_m,
     )  # fmt: skip

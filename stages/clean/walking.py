@@ -23,6 +23,7 @@ from scanloom.stages.clean.field import (
     brick_key,
     inner,
     row_made,
+    voxel_at,
 )
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8
@@ -46,9 +47,7 @@ def mark_hits(
     per_m = 1.0 / voxel_m
     for n in range(start, len(x)):
         px, py, pz = float(x[n]), float(y[n]), float(z[n])
-        i = np.int64(np.floor((T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]) * per_m))
-        j = np.int64(np.floor((T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]) * per_m))
-        k = np.int64(np.floor((T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]) * per_m))
+        i, j, k = voxel_at(px, py, pz, T, per_m)
         row = row_made(keys, rows, order, count, brick_key(i, j, k))
         if row < 0:
             return n

@@ -1,7 +1,7 @@
 """Denoise: a class for every point. Nothing is deleted here; what is not scenery is named.
 
-Own vehicle, out of range, ground, standing alone without being met again; then, by the scans shortly before and after, what is in the air and
-what moves; the rest is static until a later stage knows better.
+Own vehicle, out of range, ground, standing alone without being met again; then, by the scans shortly before and after, what
+is in the air and what moves; the rest is static until a later stage knows better.
 Source: methods 1.5 (Ren et al. 2021, steps c and d) and 2.3.1 for the ground.
 """
 
@@ -27,14 +27,13 @@ from scanloom.stages.geometry.motion import MotionTrack
 from scanloom.stages.geometry.range_image import ImageSettings, range_image
 from scanloom.stages.geometry.rig import corrected
 from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.spacing import azimuth_step_rad
 from scanloom.stages.geometry.traction import without_slips
 
 VERSION = 2
 
 U1 = NDArray[np.uint8]
 
-USUAL_BEAMS = 32
-FINEST_STEP_RAD, COARSEST_STEP_RAD = 0.001, 0.02
 REACH = 8
 IMAGE = ImageSettings(rows=128, columns=2048)
 
@@ -98,9 +97,3 @@ def classify(settings: Settings, scan: DeskewedScan, T_base_lidar: F8, beams: in
     )
     classes[ground] = PointClass.GROUND
     return classes
-
-
-def azimuth_step_rad(points: int, beams: int) -> float:
-    """Angle between neighbouring points of a beam, from their number; too wide, not too narrow, if many are missing."""
-    step = 2 * np.pi * (beams or USUAL_BEAMS) / max(points, 1)
-    return float(np.clip(step, FINEST_STEP_RAD, COARSEST_STEP_RAD))

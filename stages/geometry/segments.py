@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from scanloom.stages.geometry.forest import join, root
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.voxels import Int
 
@@ -34,18 +35,18 @@ def connected(range_m: F4) -> tuple[I4, Int]:
         for u in range(min(2, columns)):
             for w in range(columns - 2 + u, columns):
                 if range_m[v, u] > 0.0 and range_m[v, w] > 0.0 and alike(range_m[v, u], range_m[v, w]):
-                    _join(parent, v * columns + u, v * columns + w)
+                    join(parent, v * columns + u, v * columns + w)
     out = np.full((rows, columns), -1, np.int32)
     numbers = np.full(rows * columns, -1, np.int32)
     found: Int = 0
     for here in range(rows * columns):
         if parent[here] < 0:
             continue
-        root = _root(parent, here)
-        if numbers[root] < 0:
-            numbers[root] = found
+        first = root(parent, here)
+        if numbers[first] < 0:
+            numbers[first] = found
             found += 1
-        out[here // columns, here % columns] = numbers[root]
+        out[here // columns, here % columns] = numbers[first]
     return out, found
 
 
@@ -57,14 +58,14 @@ def _join_before(range_m: F4, parent: I4, v: int, u: int) -> None:
     for back in (1, 2):
         if u >= back and range_m[v, u - back] > 0.0:
             if alike(r, range_m[v, u - back]):
-                _join(parent, here, here - back)
+                join(parent, here, here - back)
             break
     for down in (1, 2):
         if v < down:
             break
         for w in range(max(u - 1, 0), min(u + 2, columns)):
             if range_m[v - down, w] > 0.0 and alike(r, range_m[v - down, w]):
-                _join(parent, here, (v - down) * columns + w)
+                join(parent, here, (v - down) * columns + w)
         if range_m[v - down, u] > 0.0:
             break
 
@@ -73,20 +74,3 @@ def _join_before(range_m: F4, parent: I4, v: int, u: int) -> None:
 def alike(a: float, b: float) -> bool:
     """Whether two ranges, m, next to each other may be of one thing."""
     return abs(a - b) < STEP_M + STEP_PER_M * min(a, b)
-
-
-@kernel
-def _root(parent: I4, i: int) -> int:
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
-
-
-@kernel
-def _join(parent: I4, i: int, j: int) -> None:
-    a, b = _root(parent, i), _root(parent, j)
-    if a < b:
-        parent[b] = a
-    else:
-        parent[a] = b

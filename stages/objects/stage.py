@@ -13,6 +13,7 @@ from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, ScanLabels
 from scanloom.schemas.session import Session
 from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.geometry.se3 import F8, inverse
+from scanloom.stages.geometry.spacing import azimuth_step_rad
 from scanloom.stages.objects.paths import ObjectPath, object_path
 from scanloom.stages.objects.settings import Settings
 from scanloom.stages.objects.tracker import History, Tracker
@@ -20,8 +21,6 @@ from scanloom.stages.objects.virtual_scan import virtual_scan
 
 VERSION = 1
 
-USUAL_BEAMS = 32
-FINEST_STEP_RAD, COARSEST_STEP_RAD = 0.001, 0.02
 USUAL_HEIGHT_M = 1.8
 
 
@@ -63,12 +62,6 @@ def _posed(
             row = int(np.searchsorted(odometry.scan_index, scan.scan_index))
             if row < len(odometry) and odometry.scan_index[row] == scan.scan_index:
                 yield row, scan, label
-
-
-def azimuth_step_rad(points: int, beams: int) -> float:
-    """Angle between neighbouring points of a beam, from their number."""
-    step = 2 * np.pi * (beams or USUAL_BEAMS) / max(points, 1)
-    return float(np.clip(step, FINEST_STEP_RAD, COARSEST_STEP_RAD))
 
 
 def _paths(settings: Settings, histories: list[History], odometry: Odometry) -> list[ObjectPath]:

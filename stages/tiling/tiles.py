@@ -37,7 +37,8 @@ class Settings(BaseModel):
 def tiles(settings: Settings, pieces: Parts[Piece]) -> tuple[Tile, RemovedTile, TileFiles]:
     """Merge the pieces of one tile: the mean point, mean intensity and majority class of every voxel.
 
-    What is left out of the map is averaged likewise, class by class. The sums are exact (see `voxel_sums`), hence the tile does not depend on the order of the pieces.
+    What is left out of the map is averaged likewise, class by class. The sums are exact (see `voxel_sums`), hence the tile
+    does not depend on the order of the pieces.
 
     Raises
     ------

@@ -141,8 +141,9 @@ def relabelled(
         settings or RelabelSettings(), Deskewed(drive.scans), Labels(drive.labels), tracks or ObjectTracks.empty(),
         cleared, drive.poses,
     )  # fmt: skip
-    labels = list(next(made))  # type: ignore[arg-type]
+    final = next(made)
+    assert isinstance(final, FinalLabels)
+    labels = list(final)
     counts = next(made)
     assert isinstance(counts, ClassCounts)
-    assert isinstance(FinalLabels(labels), FinalLabels)
     return labels, counts

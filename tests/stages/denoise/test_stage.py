@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from scanloom.schemas.scans import Deskewed, DeskewedScan, PointClass
 from scanloom.schemas.session import Extrinsic, Session
 from scanloom.schemas.tracks import Imu, Wheel
-from scanloom.stages.denoise import Settings, azimuth_step_rad, denoise
+from scanloom.stages.denoise import Settings, denoise
 from scanloom.stages.denoise.stage import REACH
 from scanloom.stages.geometry.se3 import F8, pose, so3_exp, transform
+from scanloom.stages.geometry.spacing import azimuth_step_rad
 from tests.worlds import GROUND_Z_M, BoxWorld, observe, street
 
 SETTINGS = Settings()
