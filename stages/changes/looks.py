@@ -15,7 +15,8 @@ from scanloom.stages.changes.rays import I4, fill, judge, new_image
 from scanloom.stages.changes.settings import Settings
 from scanloom.stages.geometry.se3 import F8, inverse
 
-OF_THE_MAP = (PointClass.UNLABELLED, PointClass.GROUND, PointClass.STATIC)
+STOOD = (PointClass.UNLABELLED, PointClass.GROUND, PointClass.STATIC, PointClass.CHANGED)
+"""What stood when its session passed, the map's points and what has changed since."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class ScanFiles:
         image = new_image()
         limits = settings.limits()
         for look, found, scan, label in self._read(_within_reach(settings, tiles, looks)):
-            fill(image, scan.x_m, scan.y_m, scan.z_m, np.isin(label.class_, OF_THE_MAP))
+            fill(image, scan.x_m, scan.y_m, scan.z_m, np.isin(label.class_, STOOD))
             for tile in found:
                 judge(tile.points, look.T_lidar_world, image, limits, tile.through, tile.confirming)
 

@@ -18,6 +18,7 @@ from scanloom.stages.changes.objects import objects_of
 from scanloom.stages.changes.points import standing_points
 from scanloom.stages.changes.rays import fill, judge, new_image
 from scanloom.stages.changes.stage import Settings, changes
+from scanloom.stages.geometry.se3 import transform
 from scanloom.stages.tiling import tiling
 from scanloom.stages.tiling.pieces import Settings as TilingSettings
 from tests.worlds import GROUND_Z_M, BoxWorld, drive, observe, street
@@ -103,6 +104,17 @@ def test_a_car_that_left_is_one_object_and_nothing_else_is() -> None:
     assert (table.through >= 3).all() and (table.confirming <= 0.25 * table.through).all()
     assert tuple(table.sessions) == ("new",) and table.frame == "map"
     assert files.read("changes.ply").startswith(b"ply\nformat binary_little_endian 1.0\n")
+
+
+def test_what_cleaning_took_out_because_it_changed_is_still_found() -> None:
+    old, new = day(world(CAR, POLE), 0), day(world(POLE), 1)
+    plain, _ = found(old, new)
+    for scan, label, T in zip(old.scans, old.labels, old.poses.T_world_lidar, strict=True):
+        car = within(transform(T, scan.points().astype(float)), CAR, 0.1)
+        label.class_[car & (label.class_ == PointClass.STATIC)] = PointClass.CHANGED
+    table, _ = found(old, new)
+    assert set(table.object_) == {0}
+    assert len(table) >= 0.9 * len(plain)
 
 
 def test_nothing_left_nothing_reported() -> None:
