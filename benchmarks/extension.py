@@ -7,13 +7,12 @@ and holds the new version against the truth of the simulator. What is in the sto
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 
+from benchmarks.figures import published
 from benchmarks.parking import bays, gone_scores
 from benchmarks.scores import Figure
 from benchmarks.surfaces import plane_distances
@@ -47,14 +46,7 @@ def main() -> None:
     )  # fmt: skip
     second = _made(order)
     figures = list(_figures(first, second, options.mode, options.seed))
-    rows = [figure.row() for figure in figures if np.isfinite(figure.value)]
-    if options.json == "-":
-        print(json.dumps(rows, indent=1))
-    else:
-        if options.json:
-            Path(options.json).write_text(json.dumps(rows, indent=1) + "\n")
-        for figure in figures:
-            Console(width=200).print(f"{figure.name:40} {figure.value:12.4g} {figure.unit:4} {figure.method}")
+    published(figures, options.json)
 
 
 def _options() -> argparse.Namespace:

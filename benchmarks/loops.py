@@ -11,16 +11,15 @@ Simulated drives and what the stages make of them are kept (build/bench/store) u
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks import loop_levels, places_cost, places_loops, places_search
+from benchmarks.figures import written
 from benchmarks.places_worlds import KINDS, SEEDS, World, given, simulated, world
 from benchmarks.scores import Figure
 from scanloom.schemas.errors import ScanloomError
@@ -86,13 +85,8 @@ def _of_log(folder: Path, store: Path) -> Iterator[Figure]:
 
 
 def _show(options: argparse.Namespace, figures: Sequence[Figure]) -> None:
-    rows = [figure.row() for figure in figures if np.isfinite(figure.value)]
-    text = json.dumps(rows, indent=1)
     options.out.mkdir(parents=True, exist_ok=True)
-    if options.json == "-":
-        print(text)
-    else:
-        Path(options.json or options.out / "loops.json").write_text(text + "\n")
+    written(figures, options.json or options.out / "loops.json")
     table = Table("figure", "value", "how")
     for figure in figures:
         if "within_" not in figure.name:

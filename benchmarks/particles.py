@@ -8,7 +8,6 @@ that holds `kitti_raw_0005`, real scans in clear air are labelled, too.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from benchmarks.figures import published
 from benchmarks.scores import Figure
 from benchmarks.sequences import Drive, produced
 from scanloom.pipeline.run import Result
@@ -53,14 +53,7 @@ def main() -> None:
             figures += simulated(scene, beams, options.seed, options.seconds, options.store)
     if options.data is not None:
         figures += real(options.data, options.store)
-    rows = [figure.row() for figure in figures if np.isfinite(figure.value)]
-    if options.json == "-":
-        print(json.dumps(rows, indent=1))
-    else:
-        if options.json:
-            Path(options.json).write_text(json.dumps(rows, indent=1) + "\n")
-        for figure in figures:
-            Console(width=200).print(f"{figure.name:52} {figure.value:10.5g} {figure.unit:3} {figure.method}")
+    published(figures, options.json)
 
 
 def _options() -> argparse.Namespace:

@@ -8,16 +8,14 @@ Figures: bench.tracker.<scene>.<name>.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from benchmarks.clean_boxes import LABELS, read_boxes
 from benchmarks.clean_boxes import boxed as in_boxes
+from benchmarks.figures import published
 from benchmarks.scores import Figure, Score
 from benchmarks.sequences import KITTI, Drive, produced
 from benchmarks.tracker_scores import Judge, speeds_of
@@ -52,14 +50,7 @@ def main() -> None:
         figures += [
             Figure(f"bench.tracker.{scene}.{s.name}", s.value, s.unit, "session", s.method) for s in found
         ]
-    rows = [figure.row() for figure in figures if np.isfinite(figure.value)]
-    if options.json == "-":
-        print(json.dumps(rows, indent=1))
-        return
-    if options.json:
-        Path(options.json).write_text(json.dumps(rows, indent=1) + "\n")
-    for row in rows:
-        print(f"{row['name']:52} {row['value']:12.4g} {row['unit']:4} {row['method']}")
+    published(figures, options.json)
 
 
 def _options() -> argparse.Namespace:

@@ -13,7 +13,7 @@ from scanloom.schemas.product import Files, Table, attribute, column
 
 @dataclass(frozen=True)
 class Changes(Table):
-    """One row per point of the old map that is no longer there. They stay in the map; only this table tells them."""
+    """One row per point of the old map that is no longer there. Cleaning has taken most of them out of the map."""
 
     NAME: ClassVar[str] = "changes"
 

@@ -1,10 +1,10 @@
-"""Changes: points of an extended map that its new sessions saw through. They are reported, never deleted.
+"""Changes: points of an extended map that its new sessions saw through, gathered and reported.
 
 Each scan at a keyframe of a new session is held against the standing points of the old sessions within 30 m, with the
 optimised poses of both. A point is missed when several scans looked through it and hardly any met something there. Then the
 old sessions are asked the same of what is missed: where they, too, looked through, something moved past, and only its
 remnants were in the map. What stood then and is missed now is gone; it is gathered into objects, and single points are
-left out.
+left out. Nothing is deleted here; what of it leaves the map is for cleaning to say.
 """
 
 from __future__ import annotations
