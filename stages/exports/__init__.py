@@ -1,0 +1,1 @@
+"""Exports: a finished map in the formats of other programs."""

@@ -1,0 +1,80 @@
+"""A delivered map, opened for reading: what every export starts from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from scanloom.schemas.errors import InvalidInput
+from scanloom.schemas.frames import Georeference
+from scanloom.schemas.tiles import Tile, TileIndex
+from scanloom.schemas.trajectory import Poses
+
+HEADER, INDEX = "map.json", "tiles/index.parquet"
+
+
+@dataclass(frozen=True)
+class MapSource:
+    """The folder of a map. Tiles are read one by one, whenever they are asked for."""
+
+    folder: Path
+    header: dict[str, Any]
+    """Content of `map.json`."""
+    index: TileIndex
+
+    @classmethod
+    def open(cls, folder: Path) -> MapSource:
+        """
+        Raises
+        ------
+        InvalidInput : the folder holds no map, or a damaged one.
+        """
+        try:
+            header = json.loads((folder / HEADER).read_text())
+        except (OSError, ValueError) as error:
+            raise InvalidInput(
+                f"holds no map: {HEADER} cannot be read ({error})",
+                where=str(folder),
+                next_step="give the folder that `scanloom map` wrote, for instance maps/sample",
+            ) from error
+        return cls(folder, header, TileIndex.open(folder / INDEX))
+
+    @property
+    def name(self) -> str:
+        return str(self.header["name"])
+
+    @property
+    def georeference(self) -> Georeference | None:
+        """Where the map's frame stands on the Earth; None for a map without GNSS."""
+        fields = self.index.georeference
+        return None if fields is None else Georeference(**fields)
+
+    @property
+    def tile_names(self) -> list[str]:
+        """In the order of the index."""
+        return list(dict.fromkeys(str(name) for name in self.index.tile))
+
+    def tile(self, name: str) -> Tile:
+        """Points of one tile."""
+        return Tile.open(self.folder / "tiles" / f"{name}.parquet")
+
+    def tiles(self) -> Iterator[tuple[str, Tile]]:
+        """Tile after tile, by name."""
+        for name in self.tile_names:
+            yield name, self.tile(name)
+
+    @property
+    def points(self) -> int:
+        return int(self.index.points.sum())
+
+    def trajectories(self) -> dict[str, Poses]:
+        """Poses of each session, by its name."""
+        single = self.folder / "trajectory.parquet"
+        if single.exists():
+            return {str(self.header["sessions"][0]["name"]): Poses.open(single)}
+        return {
+            path.stem: Poses.open(path) for path in sorted((self.folder / "trajectory").glob("*.parquet"))
+        }
