@@ -55,7 +55,7 @@ class MapSource:
     @property
     def tile_names(self) -> list[str]:
         """In the order of the index."""
-        return list(dict.fromkeys(str(name) for name in self.index.tile))
+        return self.index.names
 
     def tile(self, name: str) -> Tile:
         """Points of one tile."""

@@ -1,0 +1,67 @@
+"""The formats a map can be exported to.
+
+A format is a pure function of a delivered map: `write(source, folder, options)` fills `folder`, which exists and is empty, tile by tile, and
+returns the paths of its files, all inside. The verb `export` does the rest: it makes the folder beside its final place and renames it, so
+that nothing is ever half written, and records files, checksums, bounds and versions in `exports.json`. A module of a format imports what is not part of every
+installation inside its functions; `needs` names these modules and `extra` what installs them. To add a format: write the module, add one row.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from scanloom.schemas.errors import UsageError
+from scanloom.stages.exports.options import Options
+from scanloom.stages.exports.source import MapSource
+
+Write = Callable[[MapSource, Path, Options], list[Path]]
+
+
+@dataclass(frozen=True)
+class Format:
+    """One format: what `--format` calls it, one sentence for the help, what must be installed, how it is written."""
+
+    name: str
+    doc: str
+    write: Write
+    extra: str | None = None
+    """Extra of this package that brings `needs`; None where everything is always there."""
+    needs: tuple[str, ...] = ()
+    """Modules that are not part of every installation."""
+    version: int = 1
+    """Raised when the same map would give other files: old exports are then made anew."""
+
+
+_ROWS: tuple[Format, ...] = ()
+
+FORMATS: Mapping[str, Format] = {row.name: row for row in _ROWS}
+
+
+def chosen(names: list[str]) -> list[Format]:
+    """Formats by name, each once, in the order asked for.
+
+    Raises
+    ------
+    UsageError : a name that no format has, or a format whose library is not installed.
+    """
+    found = [_named(name) for name in dict.fromkeys(names)]
+    for entry in found:
+        missing = [module for module in entry.needs if find_spec(module) is None]
+        if missing:
+            raise UsageError(
+                f"the format {entry.name} needs {', '.join(missing)}, which is not installed",
+                next_step=f"pip install 'scanloom[{entry.extra}]'",
+            )
+    return found
+
+
+def _named(name: str) -> Format:
+    if name in FORMATS:
+        return FORMATS[name]
+    near = difflib.get_close_matches(name, FORMATS, n=1, cutoff=0.4)
+    hint = f"did you mean {near[0]}? " if near else ""
+    raise UsageError(f"there is no format {name!r}", next_step=f"{hint}known: {', '.join(FORMATS)}")

@@ -1,0 +1,125 @@
+"""Points as binary glTF 2.0: one interleaved buffer, small enough that a library would only wrap `struct`.
+
+Metadata follow 3D Tiles 1.1: EXT_structural_metadata says what the attributes mean.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+VERTEX = np.dtype(
+    [
+        ("position", "<f4", 3),
+        ("colour", "u1", 4),
+        ("intensity", "<f4"),
+        ("class", "u1"),
+        ("normal", "i1", 3),
+        ("session", "<u2"),
+        ("padding", "<u2"),
+    ]
+)
+"""28 bytes; every attribute starts at a multiple of its component's size, every vertex of four."""
+_FLOAT, _BYTE, _UNSIGNED_BYTE, _UNSIGNED_SHORT = 5126, 5120, 5121, 5123
+_ARRAY_BUFFER, _POINTS = 34962, 0
+_CLASS = {
+    "name": "Point",
+    "properties": {
+        "intensity": {"type": "SCALAR", "componentType": "FLOAT32", "description": "mean of the voxel's points"},
+        "classification": {"type": "SCALAR", "componentType": "UINT8", "description": "1 ground, 2 static"},
+        "session": {"type": "SCALAR", "componentType": "UINT16", "description": "session that met it first"},
+    },
+}  # fmt: skip
+_ATTRIBUTES = {"intensity": "_INTENSITY", "classification": "_CLASSIFICATION", "session": "_SESSION"}
+
+
+def glb(vertices: NDArray[Any], centre_m: tuple[float, float, float]) -> bytes:
+    """A file of vertices (n,) of dtype `VERTEX`, n > 0, positions from `centre_m`; axes are those of the map, z up.
+
+    glTF has y up, and readers of 3D Tiles turn it back: (x, y, z) of the map is (x, z, -y) there. The turn stands in the
+    node's matrix, so positions stay as they were measured.
+    """
+    x, y, z = centre_m
+    binary = vertices.tobytes()
+    body: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "scanloom"},
+        "extensionsUsed": ["EXT_structural_metadata"],
+        "extensions": {
+            "EXT_structural_metadata": {
+                "schema": {"id": "scanloom", "classes": {"point": _CLASS}},
+                "propertyAttributes": [
+                    {
+                        "class": "point",
+                        "properties": {name: {"attribute": a} for name, a in _ATTRIBUTES.items()},
+                    }
+                ],
+            }
+        },
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "matrix": [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, x, z, -y, 1]}],
+        "meshes": [{"primitives": [_primitive()]}],
+        "materials": [{"extensions": {"KHR_materials_unlit": {}}}],
+        "buffers": [{"byteLength": len(binary)}],
+        "bufferViews": [
+            {
+                "buffer": 0,
+                "byteLength": len(binary),
+                "byteStride": VERTEX.itemsize,
+                "target": _ARRAY_BUFFER,
+            }
+        ],
+        "accessors": _accessors(vertices),
+    }
+    body["extensionsUsed"].append("KHR_materials_unlit")
+    text = json.dumps(body, separators=(",", ":")).encode()
+    return _container(text + b" " * (-len(text) % 4), binary + b"\0" * (-len(binary) % 4))
+
+
+def _primitive() -> dict[str, Any]:
+    names = ("POSITION", "COLOR_0", "_INTENSITY", "_CLASSIFICATION", "_NORMAL", "_SESSION")
+    return {
+        "mode": _POINTS,
+        "material": 0,
+        "attributes": {name: number for number, name in enumerate(names)},
+        "extensions": {"EXT_structural_metadata": {"propertyAttributes": [0]}},
+    }
+
+
+def _accessors(vertices: NDArray[Any]) -> list[dict[str, Any]]:
+    position = vertices["position"]
+
+    def accessor(field: str, component: int, kind: str, **more: Any) -> dict[str, Any]:
+        offset = VERTEX.fields[field][1] if VERTEX.fields else 0
+        return {
+            "bufferView": 0, "byteOffset": offset, "componentType": component, "type": kind, "count": len(vertices), **more,
+        }  # fmt: skip
+
+    bounds = {"min": position.min(axis=0).tolist(), "max": position.max(axis=0).tolist()}
+    return [
+        accessor("position", _FLOAT, "VEC3", **bounds),
+        accessor("colour", _UNSIGNED_BYTE, "VEC4", normalized=True),
+        accessor("intensity", _FLOAT, "SCALAR"),
+        accessor("class", _UNSIGNED_BYTE, "SCALAR"),
+        accessor("normal", _BYTE, "VEC3", normalized=True),
+        accessor("session", _UNSIGNED_SHORT, "SCALAR"),
+    ]
+
+
+def _container(text: bytes, binary: bytes) -> bytes:
+    """The binary form: a header, a chunk of JSON, a chunk of bytes."""
+    total = 12 + 8 + len(text) + 8 + len(binary)
+    head = struct.pack("<4sII", b"glTF", 2, total)
+    return b"".join(
+        (
+            head,
+            struct.pack("<I4s", len(text), b"JSON"),
+            text,
+            struct.pack("<I4s", len(binary), b"BIN\0"),
+            binary,
+        )
+    )
