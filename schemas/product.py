@@ -150,16 +150,29 @@ class Table(Product):
         """As `write`, also into an open file."""
         options = (_quick_options if self.ON_THE_WAY else _writer_options)(type(self))
         with pq.ParquetWriter(sink, arrow_schema(type(self)), **options) as writer:
-            writer.write_table(self.to_arrow(), row_group_size=max(len(self), 1))
+            table, first = self.to_arrow(), 0
+            for rows in self.row_groups():
+                writer.write_table(table.slice(first, rows), row_group_size=max(rows, 1))
+                first += rows
             writer.add_key_value_metadata({FOOTER_KEY: _footer(type(self), self.attributes)})
         return len(self)
 
+    def row_groups(self) -> tuple[int, ...]:
+        """Rows of each row group of the file, in sequence; a reader may want some of them only."""
+        return (len(self),)
+
     @classmethod
-    def open(cls, path: Path) -> Self:
+    def open(cls, path: Path, groups: int | None = None) -> Self:
+        """`groups` reads only so many row groups, from the first."""
         with _NamingDamage(path):
             file = pq.ParquetFile(path, page_checksum_verification=True)
             footer = _read_footer(file, cls, path)
-            return cls.from_arrow(file.read(use_threads=False), footer["attributes"], str(path))
+            if groups is None:
+                rows = file.read(use_threads=False)
+            else:
+                wanted = range(min(groups, file.num_row_groups))
+                rows = file.read_row_groups(wanted, use_threads=False)
+            return cls.from_arrow(rows, footer["attributes"], str(path))
 
 
 ItemT = TypeVar("ItemT", bound=Table)
@@ -449,10 +462,17 @@ def describe(product: type[Product]) -> list[tuple[str, Column]]:
 def _arrow_type(spec: Column) -> pa.DataType:
     if spec.dtype == STRING:
         return pa.string()
+    if _is_bytes(spec):
+        return pa.binary(spec.width)
     scalar = pa.from_numpy_dtype(np.dtype(spec.dtype))
     if not spec.shape:
         return scalar
     return pa.list_(pa.field("element", scalar, nullable=False), spec.width)
+
+
+def _is_bytes(spec: Column) -> bool:
+    """Rows of small numbers are kept as strings of bytes: as a list, Parquet would make four bytes of each."""
+    return spec.dtype == "u1" and bool(spec.shape)
 
 
 def _blank(spec: Column) -> np.ndarray:
@@ -474,6 +494,9 @@ def _check_column(table: str, name: str, spec: Column, array: Any) -> None:
 def _to_arrow(array: np.ndarray, spec: Column) -> pa.Array:
     if spec.dtype == STRING:
         return pa.array(array.tolist(), pa.string())
+    if _is_bytes(spec):
+        data = pa.py_buffer(np.ascontiguousarray(array))
+        return pa.FixedSizeBinaryArray.from_buffers(_arrow_type(spec), len(array), [None, data])
     flat = pa.array(np.ascontiguousarray(array).reshape(-1))
     if not spec.shape:
         return flat
@@ -490,11 +513,20 @@ def _from_arrow(chunked: pa.ChunkedArray, spec: Column, name: str, where: str) -
         array = pa.concat_arrays(array.chunks)
     if spec.dtype == STRING:
         return np.array(array.to_pylist(), dtype=object)
-    if spec.shape:
-        array = array.flatten()
-    flat: np.ndarray = array.to_numpy(zero_copy_only=False)
+    if _is_bytes(spec):
+        flat = _bytes_of(array, spec.width)
+    else:
+        flat = (array.flatten() if spec.shape else array).to_numpy(zero_copy_only=False)
     flat.setflags(write=False)  # else it would depend on the size of a file whether its arrays can be written
     return flat.reshape(-1, *spec.shape) if spec.shape else flat
+
+
+def _bytes_of(array: pa.FixedSizeBinaryArray, width: int) -> np.ndarray:
+    """The bytes of all rows, one after the other."""
+    data = array.buffers()[1]
+    if not len(array) or data is None:
+        return np.empty(0, np.uint8)
+    return np.frombuffer(data, np.uint8)[array.offset * width : (array.offset + len(array)) * width]
 
 
 @_per_type
@@ -503,7 +535,7 @@ def _writer_options(table: type[Table]) -> dict[str, Any]:
     encodings: dict[str, str] = {}
     dictionaries: list[str] = []
     for name, spec in columns_of(table).items():
-        leaf = f"{name}.list.element" if spec.shape else name
+        leaf = f"{name}.list.element" if spec.shape and not _is_bytes(spec) else name
         if spec.dtype == STRING:
             dictionaries.append(leaf)
         elif np.dtype(spec.dtype).kind == "f":

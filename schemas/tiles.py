@@ -22,7 +22,7 @@ class Piece(Table):
     """What one chunk adds to one tile: sums per voxel, to be merged. One part per tile, keyed `X_Y`."""
 
     NAME: ClassVar[str] = "piece"
-    SCHEMA_VERSION: ClassVar[int] = 3
+    SCHEMA_VERSION: ClassVar[int] = 4
     ON_THE_WAY: ClassVar[bool] = True
     SPLIT_BY: ClassVar[str] = "tile"
 
@@ -38,6 +38,14 @@ class Piece(Table):
     sum_intensity: NDArray[np.float64] = column("f8", "sum of intensities")
     ground_count: NDArray[np.int32] = column("i4", "points of class ground among them")
     scan_count: NDArray[np.int32] = column("i4", "scans that hit the voxel")
+    first_ns: NDArray[np.int64] = column("i8", "reference time of the first of them", unit="ns")
+    last_ns: NDArray[np.int64] = column("i8", "reference time of the last of them", unit="ns")
+    view: NDArray[np.int8] = column(
+        "i1",
+        "direction to the LiDAR of the first scan, unit vector times 127",
+        shape=(3,),
+        frame="world or map",
+    )
     frame: str = attribute("`world` or `map`")
     georeference: dict[str, Any] | None = attribute("fields of `frames.Georeference`, or null")
     voxel_size_m: float = attribute("edge of a voxel, m")
@@ -46,10 +54,17 @@ class Piece(Table):
 
 @dataclass(frozen=True)
 class Tile(Table):
-    """Points of one tile, voxel-filtered, from the tile's own origin. One part per tile."""
+    """Points of one tile, voxel-filtered, from the tile's own origin. One part per tile.
+
+    The points of a level and of all above are the map thinned to the spacing of that level (see `spacing_m`), none twice.
+    Rows are ordered by level, coarsest first, then by the Morton code of the place: an octant of the tile is a
+    run of rows of a level. In the file the levels from `ALONE` down are row groups of their own, so that a viewer reads no more than it shows.
+    """
 
     NAME: ClassVar[str] = "tile"
-    SPLIT_BY: ClassVar[str] = "tile"
+    SCHEMA_VERSION: ClassVar[int] = 2
+    SPLIT_BY: ClassVar[str | None] = "tile"
+    ALONE: ClassVar[int] = 3
 
     x_m: NDArray[np.float32] = column(
         "f4", "from the tile's origin, along x of the map", unit="m", frame="tile"
@@ -63,12 +78,38 @@ class Tile(Table):
         "u1", "a value of PointClass: ground or static; else in a removed tile"
     )
     count: NDArray[np.int32] = column("i4", "points averaged")
+    level: NDArray[np.uint8] = column("u1", "0 is what only the full resolution has")
+    first_ns: NDArray[np.int64] = column("i8", "when the voxel was first met", unit="ns")
+    last_ns: NDArray[np.int64] = column("i8", "when it was last met", unit="ns")
+    session: NDArray[np.uint16] = column("u2", "number in `sessions` of the session that met it first")
+    normal: NDArray[np.int8] = column(
+        "i1",
+        "unit normal of the surface times 127, towards the LiDAR that met it first; zeros where there is no surface",
+        shape=(3,),
+        frame="world or map",
+    )
     offset_m: tuple[float, ...] = attribute("add to the coordinates to get the map's frame, doubles, m")
     frame: str = attribute("`world` or `map`")
     georeference: dict[str, Any] | None = attribute("fields of `frames.Georeference`, or null")
     voxel_size_m: float = attribute("edge of a voxel, m")
     tile_size_m: float = attribute("edge of a tile, m")
     sessions: tuple[str, ...] = attribute("sessions that contributed")
+
+    def row_groups(self) -> tuple[int, ...]:
+        """Rows of each row group: the coarse levels together, then level after level."""
+        coarse = int(np.count_nonzero(self.level > self.ALONE))
+        finer = [int(np.count_nonzero(self.level == level)) for level in range(self.ALONE, -1, -1)]
+        return tuple(rows for rows in (coarse, *finer) if rows) or (0,)
+
+
+def levels_of(tile_size_m: float, voxel_size_m: float) -> int:
+    """The coarsest level: one point for the whole tile."""
+    return max(int(np.ceil(np.log2(tile_size_m / voxel_size_m) - 1e-9)), 0)
+
+
+def spacing_m(level: int, tile_size_m: float, voxel_size_m: float) -> float:
+    """Edge of the cells that hold one point each of a level and those above; the voxel's own for level 0."""
+    return tile_size_m / 2.0 ** (levels_of(tile_size_m, voxel_size_m) - level) if level else voxel_size_m
 
 
 @dataclass(frozen=True)
@@ -88,25 +129,57 @@ class TileFiles(Files):
 
 @dataclass(frozen=True)
 class TileIndex(Table):
-    """One row per tile of the map."""
+    """One row per tile of the map and level, coarsest level first."""
 
     NAME: ClassVar[str] = "tile_index"
+    SCHEMA_VERSION: ClassVar[int] = 2
 
     tile: NDArray[np.object_] = column("str", "name of the tile, `X_Y` in steps of the tile size")
-    level: NDArray[np.int32] = column("i4", "0 is the full resolution")
-    points: NDArray[np.int64] = column("i8", "points in the tile")
+    level: NDArray[np.int32] = column("i4", "0 is what only the full resolution has")
+    points: NDArray[np.int64] = column("i8", "points of the level in the tile")
+    first_row: NDArray[np.int64] = column("i8", "row of the first of them in the tile")
     min_m: NDArray[np.float64] = column(
         "f8", "lowest corner of the points", unit="m", shape=(3,), frame="world or map"
     )
     max_m: NDArray[np.float64] = column(
         "f8", "highest corner of the points", unit="m", shape=(3,), frame="world or map"
     )
-    sessions: NDArray[np.object_] = column("str", "sessions that contributed, separated by spaces")
-    checksum: NDArray[np.object_] = column("str", "SHA-256 of the tile's columns")
+    sessions: NDArray[np.object_] = column(
+        "str", "sessions that contributed to the tile, separated by spaces"
+    )
+    checksum: NDArray[np.object_] = column("str", "SHA-256 of the level's rows, column by column")
     frame: str = attribute("`world` or `map`")
     georeference: dict[str, Any] | None = attribute("fields of `frames.Georeference`, or null")
     tile_size_m: float = attribute("edge of a tile, m")
     voxel_size_m: float = attribute("edge of a voxel, m")
+
+    @property
+    def names(self) -> list[str]:
+        """The tiles, each once, in order."""
+        return list(dict.fromkeys(str(name) for name in self.tile))
+
+    def by_tile(self) -> dict[str, slice]:
+        """Rows of each tile."""
+        starts = [i for i in range(len(self)) if i == 0 or self.tile[i] != self.tile[i - 1]]
+        return {str(self.tile[a]): slice(a, b) for a, b in zip(starts, [*starts[1:], len(self)])}
+
+
+@dataclass(frozen=True)
+class Overview(Tile):
+    """The coarsest levels of all tiles, as many as fit: what a viewer shows of the whole map at first.
+
+    Rows are ordered by level, coarsest first, then by tile. Coordinates are from the origin of each point's own tile.
+    """
+
+    NAME: ClassVar[str] = "overview_cloud"
+    SCHEMA_VERSION: ClassVar[int] = 1
+    SPLIT_BY: ClassVar[str | None] = None
+
+    tile: NDArray[np.int32] = column("i4", "number of the tile in the order of the index")
+
+    def row_groups(self) -> tuple[int, ...]:
+        """One row group per level."""
+        return tuple(int(rows) for rows in np.bincount(self.level)[::-1] if rows) or (0,)
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,9 @@ from scanloom.schemas.changes import ChangeFiles, Changes
 from scanloom.schemas.errors import StoreError, UsageError
 from scanloom.schemas.evaluation import Metrics, PictureFiles
 from scanloom.schemas.objects import ObjectTracks
+from scanloom.schemas.product import Files
 from scanloom.schemas.session import Session
-from scanloom.schemas.tiles import MapFiles, Tile, TileFiles, TileIndex
+from scanloom.schemas.tiles import MapFiles, Overview, RemovedTile, Tile, TileFiles, TileIndex
 from scanloom.schemas.trajectory import Poses
 from scanloom.stages.geometry.se3 import quaternion_from_matrix
 
@@ -131,15 +132,38 @@ def change_rows(result: Result) -> list[Metric]:
 
 
 def _items(result: Result) -> Iterable[Item]:
-    for _, path in result.files(MapFiles):
-        yield Item("map.ply", path / "map.ply")
-        yield Item("removed.ply", path / "removed.ply")
+    yield from _tile_items(result)
+    yield from _session_items(result)
+    for product, names in WHOLE.items():
+        for _, folder in result.files(product):
+            yield from (Item(name, folder / name) for name in names if (folder / name).exists())
+    for _, path in result.files(Changes):
+        if Changes.open(path).sessions:
+            yield Item("changes.parquet", path)
+
+
+WHOLE: dict[type[Files], tuple[str, ...]] = {
+    MapFiles: ("map.ply", "removed.ply"),
+    ChangeFiles: ("changes.ply",),
+    PictureFiles: ("preview.png",),
+}
+"""Files of the map as a whole."""
+
+
+def _tile_items(result: Result) -> Iterable[Item]:
     for coordinate, path in result.files(Tile):
         yield Item(f"tiles/{dict(coordinate)['tile']}.parquet", path)
     for coordinate, path in result.files(TileFiles):
         yield Item(f"tiles/{dict(coordinate)['tile']}.ply", path / "tile.ply")
+    for coordinate, path in result.files(RemovedTile):
+        yield Item(f"removed/{dict(coordinate)['tile']}.parquet", path)
     for _, path in result.files(TileIndex):
         yield Item("tiles/index.parquet", path)
+    for _, path in result.files(Overview):
+        yield Item("tiles/overview.parquet", path)
+
+
+def _session_items(result: Result) -> Iterable[Item]:
     poses = result.files(Poses)
     for coordinate, path in poses:
         name = trajectory_file(dict(coordinate)["session"], len(poses))
@@ -148,14 +172,6 @@ def _items(result: Result) -> Iterable[Item]:
     tracks = result.files(ObjectTracks)
     for coordinate, path in tracks:
         yield Item(objects_file(dict(coordinate)["session"], len(tracks)), path)
-    for _, path in result.files(Changes):
-        if Changes.open(path).sessions:
-            yield Item("changes.parquet", path)
-    for _, path in result.files(ChangeFiles):
-        if (path / "changes.ply").exists():
-            yield Item("changes.ply", path / "changes.ply")
-    for _, path in result.files(PictureFiles):
-        yield Item("preview.png", path / "preview.png")
 
 
 def objects_file(session: str, sessions: int) -> str:

@@ -13,7 +13,7 @@ from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.scans import Deskewed, Labels, Scans
 from scanloom.schemas.session import RawLog, Session, TruthLog
-from scanloom.schemas.tiles import MapFiles, Piece, RemovedTile, Tile, TileFiles, TileIndex
+from scanloom.schemas.tiles import MapFiles, Overview, Piece, RemovedTile, Tile, TileFiles, TileIndex
 from scanloom.schemas.tracks import Gnss, Imu, Wheel
 from scanloom.schemas.trajectory import Odometry, Poses, Truth
 from scanloom.schemas.windows import Track, TrackEnds, Window
@@ -62,7 +62,7 @@ NODES: tuple[Node, ...] = (
     node("tiling",     tiling,     per="chunk",   reads=(Deskewed, FinalLabels, Poses),        writes=Piece),
     node("changes",    changes,    per="map",     reads=(Base, Poses, Deskewed, FinalLabels, Piece), writes=(Changes, ChangeFiles)),
     node("tiles",      tiles,      per="tile",    reads=(Piece,),                              writes=(Tile, RemovedTile, TileFiles)),
-    node("overview",   overview,   per="map",     reads=(Tile, RemovedTile),                   writes=(TileIndex, MapFiles)),
+    node("overview",   overview,   per="map",     reads=(Tile, RemovedTile),                   writes=(TileIndex, Overview, MapFiles)),
     node("evaluation", evaluation, per="map",     reads=(Session, Truth, Odometry, Poses, Loops, Graph, Gnss, Tile, SensorCheck, ClassCounts, RemovedTile), writes=(Metrics, ErrorTrack)),
     node("picture",    picture,    per="map",     reads=(Poses, Loops, Graph, TileIndex, Tile, RemovedTile), writes=PictureFiles),
     node("report",     report,     per="map",     reads=(Session, Metrics, ErrorTrack, Odometry, Poses, Loops, Graph, TileIndex, PictureFiles, SensorCheck, Changes), writes=ReportFiles),

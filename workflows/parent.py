@@ -114,9 +114,9 @@ def altered_tiles(parent: Parent, out: Path) -> list[str]:
     files = read_map(out).get("files", {})
     index = TileIndex.open(out / "tiles" / "index.parquet")
     return [
-        str(tile)
-        for tile, sessions in zip(index.tile, index.sessions, strict=True)
-        if set(sessions.split()) <= old
+        tile
+        for tile, rows in index.by_tile().items()
+        if set(index.sessions[rows.start].split()) <= old
         and files.get(f"tiles/{tile}.parquet") != parent.files.get(f"tiles/{tile}.parquet")
     ]
 

@@ -54,16 +54,18 @@ def metric_tables(sessions: dict[str, Session], figures: Figures) -> list[Metric
 
 
 def tile_rows(index: TileIndex) -> list[dict[str, Any]]:
-    """One row per tile with its bounds."""
+    """One row per tile with its bounds; the checksum is that of the finest level."""
     return [
         {
-            "tile": index.tile[i],
-            "points": int(index.points[i]),
-            "ranges": [(float(low), float(high)) for low, high in zip(index.min_m[i], index.max_m[i])],
-            "sessions": index.sessions[i],
-            "checksum": index.checksum[i],
+            "tile": name,
+            "points": int(index.points[rows].sum()),
+            "ranges": list(
+                zip(index.min_m[rows].min(axis=0).tolist(), index.max_m[rows].max(axis=0).tolist())
+            ),
+            "sessions": index.sessions[rows][-1],
+            "checksum": index.checksum[rows][-1],
         }
-        for i in range(len(index))
+        for name, rows in index.by_tile().items()
     ]
 
 

@@ -1,10 +1,12 @@
-"""Overview: the list of tiles, and the whole map as one cloud."""
+"""Overview: the list of tiles, the whole map as one cloud, and its coarsest levels for those who look at all of it."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
-from typing import IO
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,28 +14,41 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from scanloom.schemas.errors import StageError
 from scanloom.schemas.product import Parts, columns_of
-from scanloom.schemas.tiles import MapFiles, RemovedTile, Tile, TileIndex
+from scanloom.schemas.tiles import MapFiles, Overview, RemovedTile, Tile, TileIndex
+from scanloom.stages.geometry import ply
 from scanloom.stages.geometry.voxels import downsample
-from scanloom.stages.tiling import ply
 from scanloom.stages.tiling.grid import tile_position
 
-VERSION = 1
+VERSION = 2
+
+F8 = NDArray[np.float64]
+
+HELD_BYTES = 1 << 28
+"""Of vertices of the map in memory; more wait in a temporary file."""
 
 
 class Settings(BaseModel):
-    """How coarse the one-file map is."""
+    """How coarse the one-file map is, and how much of the map is seen at a glance."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     map_voxel_size_m: float = Field(0.2, ge=0.01, le=10.0, description="edge of a voxel of map.ply, m")
+    overview_points: int = Field(
+        4_000_000,
+        ge=1,
+        le=100_000_000,
+        description="the coarsest levels that together have at most so many points are in the overview, number",
+    )
 
 
 def overview(
     settings: Settings, tiles: Parts[Tile], removed: Parts[RemovedTile] | None = None
-) -> tuple[TileIndex, MapFiles]:
-    """List the tiles with bounds and checksums, and write `map.ply` and `removed.ply` tile by tile.
+) -> tuple[TileIndex, Overview, MapFiles]:
+    """List the tiles with bounds and checksums, gather their coarsest levels, write `map.ply` and `removed.ply`.
 
-    `removed.ply` has all points that are left out of the map, `map.ply` one point in each coarser voxel. They have float32 coordinates from the origin of the map: steps of 0.06 mm at 1 km and 1 mm at 10 km.
+    `removed.ply` has all points that are left out of the map, `map.ply` one point in each coarser voxel. They have
+    float32 coordinates from the origin of the map: steps of 0.06 mm at 1 km and 1 mm at 10 km. Tiles are read once and
+    are in memory one by one; of all of them only what the overview holds.
 
     Raises
     ------
@@ -44,55 +59,83 @@ def overview(
             "the map has no tiles: no point was kept",
             next_step="look at the labels and at `tiling.classes`, which says which classes enter the map",
         )
-    surveys = [_survey(c["tile"], tile, settings.map_voxel_size_m) for c, tile in tiles.items()]
+    surveys: list[Survey] = []
+    coarsest = _Coarsest(settings.overview_points)
+    spool = tempfile.SpooledTemporaryFile(HELD_BYTES)  # noqa: SIM115  it lives until map.ply is written
+    for where, tile in tiles.items():
+        surveys.append(_survey(where["tile"], tile))
+        coarsest.add(where["tile"], tile)
+        spool.write(_vertices(tile, coarse_picks(tile, settings.map_voxel_size_m)))
     index = tile_index(surveys, tiles[0])
-
     comments = ply.georeference_comments(index.frame, index.georeference, (0.0, 0.0, 0.0))
 
     def write_map(stream: IO[bytes]) -> None:
-        points = sum(len(survey.coarse) for survey in surveys) // ply.VERTEX.itemsize
-        stream.write(ply.header(points, ["scanloom map", *comments]))
-        stream.writelines(survey.coarse for survey in surveys)
+        stream.write(ply.header(spool.tell() // ply.VERTEX.itemsize, ["scanloom map", *comments]))
+        stream.writelines(_contents(spool))
 
     def write_removed(stream: IO[bytes]) -> None:
         left_out = removed if removed is not None else ()
         stream.write(ply.header(sum(map(len, left_out)), ["scanloom points left out of the map", *comments]))
         stream.writelines(_vertices(tile, np.arange(len(tile))) for tile in left_out)
 
-    return index, MapFiles(contents={"map.ply": write_map, "removed.ply": write_removed})
+    return (
+        index,
+        coarsest.gathered(index),
+        MapFiles(contents={"map.ply": write_map, "removed.ply": write_removed}),
+    )
+
+
+def _contents(spool: IO[bytes]) -> Iterator[bytes]:
+    """All that was written to a file, which is left at its end."""
+    spool.seek(0)
+    while block := spool.read(1 << 24):
+        yield block
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What the overview keeps of a tile, so that tiles are in memory one by one."""
+    """What the list of tiles says of one."""
 
     name: str
-    points: int
-    low_m: NDArray[np.float64]
-    high_m: NDArray[np.float64]
+    level: NDArray[np.int32]
+    """(levels,) that have points, coarsest first."""
+    points: NDArray[np.int64]
+    low_m: F8
+    high_m: F8
     sessions: tuple[str, ...]
-    checksum: str
-    coarse: bytes
-    """Its vertices of `map.ply`."""
+    checksum: list[str]
 
 
-def _survey(name: str, tile: Tile, map_voxel_size_m: float) -> Survey:
-    low, high = _bounds(tile)
-    coarse = _vertices(tile, coarse_picks(tile, map_voxel_size_m))
-    return Survey(name, len(tile), low, high, tuple(tile.sessions), checksum(tile), coarse)
+def _survey(name: str, tile: Tile) -> Survey:
+    starts = np.flatnonzero(np.diff(tile.level.astype(np.int32), prepend=-1))
+    runs = [tile.take(slice(a, b)) for a, b in zip(starts, [*starts[1:], len(tile)])]
+    low, high = zip(*map(_bounds, runs)) if runs else ([], [])
+    return Survey(
+        name,
+        tile.level[starts].astype(np.int32),
+        np.array([len(run) for run in runs], np.int64),
+        np.array(low, float).reshape(-1, 3),
+        np.array(high, float).reshape(-1, 3),
+        tuple(tile.sessions),
+        [checksum(run) for run in runs],
+    )
 
 
 def tile_index(surveys: list[Survey], example: Tile) -> TileIndex:
-    """One row per tile, ordered by (x, y); grid and georeference are those of any tile."""
-    rows = sorted(surveys, key=lambda survey: tile_position(survey.name))
+    """Rows of each tile and level, ordered by (x, y); grid and georeference are those of any tile."""
+    tiles = sorted(surveys, key=lambda survey: tile_position(survey.name))
+    repeats = [len(tile.level) for tile in tiles]
+    named = [tile.name for tile in tiles]
+    sessions = [" ".join(tile.sessions) for tile in tiles]
     return TileIndex(
-        tile=np.array([row.name for row in rows], object),
-        level=np.zeros(len(rows), np.int32),
-        points=np.array([row.points for row in rows], np.int64),
-        min_m=np.array([row.low_m for row in rows]),
-        max_m=np.array([row.high_m for row in rows]),
-        sessions=np.array([" ".join(row.sessions) for row in rows], object),
-        checksum=np.array([row.checksum for row in rows], object),
+        tile=np.repeat(np.array(named, object), repeats),
+        level=np.concatenate([tile.level for tile in tiles]),
+        points=np.concatenate([tile.points for tile in tiles]),
+        first_row=np.concatenate([np.cumsum(tile.points) - tile.points for tile in tiles]),
+        min_m=np.concatenate([tile.low_m for tile in tiles]),
+        max_m=np.concatenate([tile.high_m for tile in tiles]),
+        sessions=np.repeat(np.array(sessions, object), repeats),
+        checksum=np.array([digest for tile in tiles for digest in tile.checksum], object),
         frame=example.frame,
         georeference=example.georeference,
         tile_size_m=example.tile_size_m,
@@ -100,10 +143,64 @@ def tile_index(surveys: list[Survey], example: Tile) -> TileIndex:
     )
 
 
+@dataclass
+class _Coarsest:
+    """The coarsest levels of the tiles so far that have no more than `most` points together; the coarsest of all always."""
+
+    most: int
+    finest: int = 0
+    """Level below which nothing is kept."""
+    held: list[tuple[str, Tile]] = field(default_factory=list)
+    points: int = 0
+
+    def add(self, name: str, tile: Tile) -> None:
+        kept = tile.take(tile.level >= self.finest)
+        self.held.append((name, kept))
+        self.points += len(kept)
+        while self.points > self.most and any((tile.level > self.finest).any() for _, tile in self.held):
+            self.finest += 1
+            self.held = [(name, tile.take(tile.level >= self.finest)) for name, tile in self.held]
+            self.points = sum(len(tile) for _, tile in self.held)
+
+    def gathered(self, index: TileIndex) -> Overview:
+        """As one table, sessions numbered for the whole map."""
+        number = {name: i for i, name in enumerate(index.names)}
+        held = sorted(
+            ((number[name], tile) for name, tile in self.held if len(tile)), key=lambda pair: pair[0]
+        )
+        sessions = sorted({session for _, tile in held for session in tile.sessions})
+        columns = [_renumbered(tile, sessions) for _, tile in held]
+        joined: dict[str, Any] = {
+            name: np.concatenate([each[name] for each in columns])
+            if columns
+            else getattr(self.held[0][1], name)
+            for name in columns_of(Tile)
+        }
+        tile = np.repeat(np.array([i for i, _ in held], np.int32), [len(tile) for _, tile in held])
+        return _by_level(
+            Overview(
+                **joined,
+                tile=tile,
+                **{**self.held[0][1].attributes, "offset_m": (0.0, 0.0, 0.0), "sessions": tuple(sessions)},
+            )
+        )
+
+
+def _renumbered(tile: Tile, sessions: list[str]) -> dict[str, Any]:
+    """Columns of a tile, its sessions numbered as in `sessions`."""
+    columns = {name: getattr(tile, name) for name in columns_of(Tile)}
+    number = np.array([sessions.index(name) for name in tile.sessions], np.uint16)
+    return {**columns, "session": number[tile.session] if len(number) else tile.session}
+
+
+def _by_level(cloud: Overview) -> Overview:
+    return cloud.take(np.argsort(cloud.level.max(initial=0) - cloud.level, kind="stable"))
+
+
 def checksum(tile: Tile) -> str:
     """SHA-256 over the bytes of all columns in their declared order, little-endian."""
     digest = hashlib.sha256()
-    for name in columns_of(Tile):
+    for name in columns_of(type(tile)):
         digest.update(np.ascontiguousarray(getattr(tile, name)).data)
     return digest.hexdigest()
 

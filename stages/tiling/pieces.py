@@ -18,7 +18,7 @@ from scanloom.schemas.trajectory import Poses
 from scanloom.stages.tiling.grid import check_grid, tile_name
 from scanloom.stages.tiling.voxel_sums import TileSums, VoxelSums
 
-VERSION = 1
+VERSION = 2
 
 
 class Settings(BaseModel):
@@ -84,23 +84,23 @@ class _Sums:
         self._sums: dict[int, tuple[NDArray[np.bool_], VoxelSums]] = {}
 
     def add(self, scan: DeskewedScan, classes: NDArray[np.uint8], T_world_lidar: NDArray[np.float64]) -> None:
-        xyz = (scan.x_m, scan.y_m, scan.z_m)
-        self._of(0).add(xyz, scan.intensity, classes, self._sums[0][0], int(PointClass.GROUND), T_world_lidar)
+        self._add(0, scan, classes, T_world_lidar)
         met = np.bincount(classes, minlength=256)
         for class_ in self._out:
             if met[class_]:
-                rank = 1 + LEFT_OUT.index(class_)
-                sums = self._of(rank)
-                sums.add(
-                    xyz, scan.intensity, classes, self._sums[rank][0], int(PointClass.GROUND), T_world_lidar
-                )
+                self._add(1 + LEFT_OUT.index(class_), scan, classes, T_world_lidar)
 
-    def _of(self, rank: int) -> VoxelSums:
+    def _add(self, rank: int, scan: DeskewedScan, classes: NDArray[np.uint8], T: NDArray[np.float64]) -> None:
+        keep, sums = self._of(rank)
+        xyz = (scan.x_m, scan.y_m, scan.z_m)
+        sums.add(xyz, scan.intensity, classes, keep, int(PointClass.GROUND), T, scan.reference_ns)
+
+    def _of(self, rank: int) -> tuple[NDArray[np.bool_], VoxelSums]:
         if rank not in self._sums:
             classes = self._settings.classes if rank == 0 else (LEFT_OUT[rank - 1],)
             sums = VoxelSums(self._settings.voxel_size_m, self._settings.tile_size_m)
             self._sums[rank] = (_kept(classes), sums)
-        return self._sums[rank][1]
+        return self._sums[rank]
 
     def tiles(self) -> Iterator[tuple[tuple[int, int], list[tuple[int, TileSums]]]]:
         """Position of each tile, with its sums by rank, ordered."""

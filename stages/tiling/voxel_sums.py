@@ -31,10 +31,16 @@ _TILE_HALF, _HEIGHT_HALF = 1 << (_TILE_BITS - 1), 1 << (_HEIGHT_BITS - 1)
 _TILE_SHIFT = 2 * _SIDE_BITS + _HEIGHT_BITS
 _BLOCK = 1 | 1 << _HEIGHT_BITS | 1 << (_SIDE_BITS + _HEIGHT_BITS)
 """The lowest bit of each of the three indices."""
+STEP_X, STEP_Y = 1 << (_SIDE_BITS + _HEIGHT_BITS), 1 << _HEIGHT_BITS
+"""From a packed voxel to the next along x, and along y."""
 _EMPTY = -1
 
-# Layout of one record of eight doubles (64 bytes).
-_X, _Y, _Z, _INTENSITY, _COUNT, _GROUND, _SCANS, _LAST = range(8)
+# Layout of one record of eight doubles (64 bytes). Points of ground are counted in the upper half of the count.
+_X, _Y, _Z, _INTENSITY, _COUNT, _SCANS, _FIRST, _LAST = range(8)
+_SUMS = 5
+_ONE_OF_GROUND = 2.0**32
+VIEW_STEPS = 127.0
+"""Components of directions are kept in such steps of a unit vector."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +56,9 @@ class TileSums:
     sum_intensity: NDArray[np.float64]
     ground_count: NDArray[np.int32]
     scan_count: NDArray[np.int32]
+    first_ns: NDArray[np.int64]
+    last_ns: NDArray[np.int64]
+    view: NDArray[np.int8]
 
 
 def voxel_indices(voxel: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -72,7 +81,8 @@ class VoxelSums:
         self._side = round(tile_size_m / voxel_size_m)
         self._used = 0
         self._keys, self._records = np.empty(0, np.int64), np.empty((0, 8))
-        self._scans = 0
+        self._stamps_ns: list[int] = []
+        self._places_m: list[NDArray[np.float64]] = []
         self._runs = _Runs(0)
         self._rehash(FIRST_SLOTS)
 
@@ -87,8 +97,9 @@ class VoxelSums:
         keep: NDArray[np.bool_],
         ground_class: int,
         T: NDArray[np.float64],
+        stamp_ns: int,
     ) -> None:
-        """Add one scan: x, y, z (n,) f32 in the LiDAR frame, its classes (n,), and T_world_lidar (4, 4).
+        """Add one scan: x, y, z (n,) f32 in the LiDAR frame, its classes (n,), T_world_lidar (4, 4), reference time.
 
         `keep` (256,) says for each class whether it enters the map. Points that are not finite are skipped.
 
@@ -97,7 +108,8 @@ class VoxelSums:
         StageError : a point lies further from the origin of the map than the grid reaches.
         """
         n = len(points[0])
-        self._scans += 1
+        self._stamps_ns.append(stamp_ns)
+        self._places_m.append(T[:3, 3].copy())
         self._grow_for(n)
         if len(self._runs.keys) < n:
             self._runs = _Runs(n + n // 8)
@@ -112,14 +124,19 @@ class VoxelSums:
                 next_step="look at the poses of this session: they have most likely diverged",
             )
         self._used = _find(runs.keys[:found], runs.rows, self._table, self._keys, self._used)
-        _add(runs.rows[:found], runs.sums, self._records, self._scans)
+        _add(runs.rows[:found], runs.sums, self._records, len(self._stamps_ns))
 
     def tiles(self) -> list[TileSums]:
         """All voxels, tile by tile, ordered by tile and voxel."""
         keys = self._keys[: self._used]
         order = np.argsort(keys)
         keys = keys[order]
-        columns: tuple[Any, ...] = (keys & ((1 << _TILE_SHIFT) - 1), *_columns(order, self._records))
+        stamps = np.array(self._stamps_ns, np.int64)
+        places = np.array(self._places_m).reshape(-1, 3)
+        columns: tuple[Any, ...] = (
+            keys & ((1 << _TILE_SHIFT) - 1),
+            *_columns(keys, order, self._records, stamps, places, self._tile_m),
+        )
         starts = np.flatnonzero(np.diff(keys >> _TILE_SHIFT, prepend=_EMPTY))
         ends = np.append(starts[1:], len(keys))
         return [TileSums(_tile(keys[a]), *(c[a:b] for c in columns)) for a, b in zip(starts, ends)]
@@ -148,7 +165,7 @@ class _Runs:
 
     def __init__(self, points: int) -> None:
         self.keys = np.empty(points, np.int64)
-        self.sums = np.empty((points, 6))
+        self.sums = np.empty((points, _SUMS))
         self.rows = np.empty(points, np.int32)
 
 
@@ -188,12 +205,12 @@ def _runs(
 ) -> int:  # fmt: skip
     """Kept points of one scan, those that follow each other in one voxel added up: near the sensor most do.
 
-    Fills `keys` (n,) and `sums` (n, 6): x, y, z from the tile's corner and intensity in whole steps, points, points of
-    ground; returns their number, or -1 when a point is out of the grid.
+    Fills `keys` (n,) and `sums` (n, 5): x, y, z from the tile's corner and intensity in whole steps, points (of ground:
+    see `_ONE_OF_GROUND`); returns their number, or -1 when a point is out of the grid.
     """
     runs = 0
     last = np.int64(_EMPTY)
-    sx, sy, sz, light, points, ground = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    sx, sy, sz, light, points = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(len(xs)):
         if not keep[classes[i]]:
             continue
@@ -216,16 +233,15 @@ def _runs(
             last = key
             runs += 1
             keys[runs - 1] = key
-            sx, sy, sz, light, points, ground = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            sx, sy, sz, light, points = 0.0, 0.0, 0.0, 0.0, 0.0
         sx += np.rint(x / STEP_M)
         sy += np.rint(y / STEP_M)
         sz += np.rint(z / STEP_M)
         light += np.rint(intensity[i] / INTENSITY_STEP) if np.isfinite(intensity[i]) else 0.0
-        points += 1.0
-        ground += 1.0 if classes[i] == ground_class else 0.0
+        points += 1.0 + _ONE_OF_GROUND if classes[i] == ground_class else 1.0
         into = sums[runs - 1]
         into[_X], into[_Y], into[_Z], into[_INTENSITY] = sx, sy, sz, light
-        into[_COUNT], into[_GROUND] = points, ground
+        into[_COUNT] = points
     return runs
 
 
@@ -259,7 +275,9 @@ def _add(rows: NDArray[np.int32], sums: NDArray[np.float64], records: NDArray[np
     """Add each run to its voxel."""
     for i in range(len(rows)):
         record = records[rows[i]]
-        for k in range(6):
+        if record[_COUNT] == 0.0:
+            record[_FIRST] = scan
+        for k in range(_SUMS):
             record[k] += sums[i, k]
         if record[_LAST] != scan:
             record[_SCANS] += 1.0
@@ -268,15 +286,30 @@ def _add(rows: NDArray[np.int32], sums: NDArray[np.float64], records: NDArray[np
 
 @kernel
 def _columns(
-    order: NDArray[np.int64], records: NDArray[np.float64]
-) -> tuple[NDArray[np.int32], F8, F8, F8, F8, NDArray[np.int32], NDArray[np.int32]]:
-    """Columns of a piece but for the voxel, rows in this order."""
+    keys: NDArray[np.int64], order: NDArray[np.int64], records: NDArray[np.float64], stamps_ns: NDArray[np.int64],
+    places_m: NDArray[np.float64], tile_m: float,
+) -> tuple[
+    NDArray[np.int32], F8, F8, F8, F8, NDArray[np.int32], NDArray[np.int32], NDArray[np.int64], NDArray[np.int64],
+    NDArray[np.int8],
+]:  # fmt: skip
+    """Columns of a piece but for the voxel, rows in this order; scans are numbered from one."""
     n = len(order)
     count, ground, scans = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
     x, y, z, intensity = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    first, last, view = np.empty(n, np.int64), np.empty(n, np.int64), np.empty((n, 3), np.int8)
     for i in range(n):
         record = records[order[i]]
+        of_ground = np.floor(record[_COUNT] / _ONE_OF_GROUND)
+        points = record[_COUNT] - of_ground * _ONE_OF_GROUND
         x[i], y[i], z[i] = record[_X] * STEP_M, record[_Y] * STEP_M, record[_Z] * STEP_M
         intensity[i] = record[_INTENSITY] * INTENSITY_STEP
-        count[i], ground[i], scans[i] = record[_COUNT], record[_GROUND], record[_SCANS]
-    return count, x, y, z, intensity, ground, scans
+        count[i], ground[i], scans[i] = points, of_ground, record[_SCANS]
+        at = np.int64(record[_FIRST]) - 1
+        first[i], last[i] = stamps_ns[at], stamps_ns[np.int64(record[_LAST]) - 1]
+        tile = keys[i] >> _TILE_SHIFT
+        dx = places_m[at, 0] - ((tile >> _TILE_BITS) - _TILE_HALF) * tile_m - x[i] / points
+        dy = places_m[at, 1] - ((tile & ((1 << _TILE_BITS) - 1)) - _TILE_HALF) * tile_m - y[i] / points
+        dz = places_m[at, 2] - z[i] / points
+        scale = VIEW_STEPS / max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-9)
+        view[i, 0], view[i, 1], view[i, 2] = np.rint(dx * scale), np.rint(dy * scale), np.rint(dz * scale)
+    return count, x, y, z, intensity, ground, scans, first, last, view

@@ -9,6 +9,7 @@ from scanloom.schemas.clean import ClassCounts
 from scanloom.schemas.scans import PointClass
 from scanloom.schemas.tiles import RemovedTile, Tile
 from scanloom.stages.evaluation.removed import count_figures, crispness_figures
+from tests.tiles import tile_of
 
 
 def counts(**points: int) -> ClassCounts:
@@ -19,13 +20,7 @@ def counts(**points: int) -> ClassCounts:
 
 
 def tile(kind: type[Tile], points: np.ndarray, class_: PointClass) -> Tile:
-    x, y, z = (np.ascontiguousarray(c) for c in points.astype(np.float32).T)
-    n = len(points)
-    return kind(
-        x_m=x, y_m=y, z_m=z, intensity=np.zeros(n, np.float32), class_=np.full(n, class_, np.uint8),
-        count=np.ones(n, np.int32), offset_m=(0.0, 0.0, 0.0), frame="map", georeference=None, voxel_size_m=0.1,
-        tile_size_m=50.0, sessions=("a",),
-    )  # fmt: skip
+    return tile_of(points, kind=kind, class_=int(class_))
 
 
 def test_shares_are_of_what_could_be_mapped() -> None:

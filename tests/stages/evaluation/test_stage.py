@@ -27,16 +27,11 @@ from tests.stages.mapping import (
     session_of,
     truth_of,
 )
+from tests.tiles import tile_of
 
 
 def random_tile(points: F8, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Tile:
-    n = len(points)
-    xyz = points.astype(np.float32)
-    return Tile(
-        x_m=xyz[:, 0].copy(), y_m=xyz[:, 1].copy(), z_m=xyz[:, 2].copy(), intensity=np.ones(n, np.float32),
-        class_=np.ones(n, np.uint8), count=np.ones(n, np.int32), offset_m=offset, frame="map", georeference=None,
-        voxel_size_m=0.1, tile_size_m=50.0, sessions=("a",),
-    )  # fmt: skip
+    return tile_of(points, offset_m=offset)
 
 
 def run(

@@ -18,7 +18,7 @@ VIEW = View(0.0, 0.0, 40, 20, 0.5)
 def test_points_are_drawn_in_the_colour_of_their_class_and_nothing_elsewhere() -> None:
     places = np.array([[5.2, 5.2, 0.0], [99.0, 5.0, 0.0], [5.2, 5.2, 3.0], [15.2, 5.2, 0.0]])
     both = tile(RemovedTile, places, PointClass.DYNAMIC)
-    both.class_[2:] = PointClass.OUTLIER
+    both.class_[(both.z_m > 1) | (both.x_m == np.float32(15.2))] = PointClass.OUTLIER
     drawn = np.asarray(left_out([both], VIEW))
     assert drawn.shape == (20, 40)
     values = [1 + LEFT_OUT.index(c) for c in (PointClass.DYNAMIC, PointClass.OUTLIER)]

@@ -55,7 +55,7 @@ class Map:
     def __init__(self) -> None:
         self.scans, self.T = drive(street(), 5, step_m=8.0)
         self.tiles = tile_parts(tiles_of([Source("a", "0000", pieces_of(self.scans, self.T))]))
-        self.index, _ = overview(OverviewSettings(), self.tiles)
+        self.index, _, _ = overview(OverviewSettings(), self.tiles)
 
     def report(self, **changed: Any) -> ReportFiles:
         given: dict[str, Any] = {

@@ -10,7 +10,8 @@ import pytest
 from scanloom.schemas.errors import StageError
 from scanloom.schemas.product import Parts
 from scanloom.schemas.tiles import Tile
-from scanloom.stages.tiling import overview, ply
+from scanloom.stages.geometry import ply
+from scanloom.stages.tiling import overview
 from scanloom.stages.tiling.overview import Settings, checksum
 from tests.stages.mapping import Source, pieces_of, tile_parts, tiles_of
 from tests.worlds import drive, street
@@ -30,14 +31,18 @@ def read_ply(data: bytes) -> np.ndarray:
 
 
 def test_index_lists_every_tile_with_its_bounds(tiles: Parts[Tile]) -> None:
-    index, _ = overview(Settings(), tiles)
-    assert len(index) == len(tiles)
+    index, _, _ = overview(Settings(), tiles)
+    assert index.names == list(index.by_tile())
+    assert len(index.names) == len(tiles)
     assert index.points.sum() == sum(len(tile) for tile in tiles)
     by_name = {c["tile"]: tile for c, tile in tiles.items()}
-    positions = [tuple(int(v) for v in name.split("_")) for name in index.tile]
+    positions = [tuple(int(v) for v in name.split("_")) for name in index.names]
     assert positions == sorted(positions)
-    for name, low, high, digest in zip(index.tile, index.min_m, index.max_m, index.checksum):
-        tile = by_name[name]
+    for name, level, points, first, low, high, digest in zip(
+        index.tile, index.level, index.points, index.first_row, index.min_m, index.max_m, index.checksum
+    ):
+        tile = by_name[name].take(slice(first, first + points))
+        assert (tile.level == level).all()
         assert np.allclose(low, np.array([tile.x_m.min(), tile.y_m.min(), tile.z_m.min()]) + tile.offset_m)
         assert (low <= high).all()
         assert digest == checksum(tile)
@@ -53,7 +58,7 @@ def test_checksum_changes_with_one_bit(tiles: Parts[Tile]) -> None:
 
 
 def test_the_map_is_the_thinned_union_of_the_tiles(tiles: Parts[Tile]) -> None:
-    _, files = overview(Settings(map_voxel_size_m=0.5), tiles)
+    _, _, files = overview(Settings(map_voxel_size_m=0.5), tiles)
     points = read_ply(files.read("map.ply"))
     everything = np.concatenate(
         [np.column_stack((t.x_m, t.y_m, t.z_m)).astype(float) + t.offset_m for t in tiles]
@@ -66,7 +71,7 @@ def test_the_map_is_the_thinned_union_of_the_tiles(tiles: Parts[Tile]) -> None:
 
 
 def test_a_map_as_fine_as_its_tiles_keeps_every_point(tiles: Parts[Tile]) -> None:
-    _, files = overview(Settings(map_voxel_size_m=0.1), tiles)
+    _, _, files = overview(Settings(map_voxel_size_m=0.1), tiles)
     buffer = io.BytesIO()
     files.contents["map.ply"](buffer)  # type: ignore[operator]
     assert len(read_ply(buffer.getvalue())) == sum(len(tile) for tile in tiles)
@@ -77,3 +82,33 @@ def test_no_tiles_is_an_error_with_advice() -> None:
     with pytest.raises(StageError, match="no tiles") as caught:
         overview(Settings(), Parts([]))
     assert "tiling.classes" in str(caught.value)
+
+
+def test_the_overview_holds_the_coarsest_levels_that_fit(tiles: Parts[Tile]) -> None:
+    everything = sum(len(tile) for tile in tiles)
+    index, whole, _ = overview(Settings(overview_points=everything), tiles)
+    assert len(whole) == everything
+    assert (np.diff(whole.level.astype(int)) <= 0).all()
+    levels = sorted(set(index.level.tolist()))
+    for finest in levels[1:]:
+        fits = int(index.points[index.level >= finest].sum())
+        for most, kept in ((fits, finest), (fits - 1, finest + 1)):
+            if kept > max(levels):
+                continue
+            _, some, _ = overview(Settings(overview_points=most), tiles)
+            assert some.level.min() == kept
+            assert len(some) == index.points[index.level >= kept].sum()
+    _, least, _ = overview(Settings(overview_points=1), tiles)
+    assert len(least) == index.points[index.level == max(levels)].sum()  # of a map there is always something to see
+
+
+def test_points_of_the_overview_are_those_of_their_tiles(tiles: Parts[Tile]) -> None:
+    index, whole, _ = overview(Settings(), tiles)
+    by_name = {c["tile"]: tile for c, tile in tiles.items()}
+    for number, name in enumerate(index.names):
+        rows = whole.tile == number
+        tile = by_name[name]
+        assert np.array_equal(whole.x_m[rows], tile.x_m)
+        assert np.array_equal(whole.first_ns[rows], tile.first_ns)
+    assert set(whole.sessions) == {"a"}
+    assert sum(whole.row_groups()) == len(whole)
