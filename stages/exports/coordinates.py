@@ -70,6 +70,17 @@ class Projector:
             return horizontal.to_3d()
         return CRS(f"EPSG:{self.epsg}+{self.vertical_epsg}")
 
+    @property
+    def heights(self) -> str:
+        """What heights are counted from, in words."""
+        if self.epsg is None:
+            return "above the origin of the map's own frame, m"
+        if self.vertical_epsg is None:
+            return "above the WGS84 ellipsoid, m"
+        from pyproj import CRS
+
+        return f"above the geoid, {CRS.from_epsg(self.vertical_epsg).name} (EPSG:{self.vertical_epsg})"
+
     def project(self, points: ArrayLike) -> F8:
         """x, y, height (n, 3) of points (n, 3) of the map's frame, m; exact."""
         p = np.asarray(points, float).reshape(-1, 3)
