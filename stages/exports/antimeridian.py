@@ -36,9 +36,10 @@ def cut_line(positions: ArrayLike) -> list[F8]:
     line = np.array(positions, float)
     line[:, 0] = unrolled(line[:, 0])
     turn = np.floor((line[:, 0] + DATE_LINE_DEG) / 360.0)
-    pieces, begin = [], 0
+    pieces: list[F8] = []
+    begin = 0
     head = np.empty((0, line.shape[1]))
-    for i in np.flatnonzero(np.diff(turn)):
+    for i in np.flatnonzero(np.diff(turn)).tolist():
         crossing = _crossing(line[i], line[i + 1], 360.0 * max(turn[i], turn[i + 1]) - DATE_LINE_DEG)
         pieces.append(_moved(np.vstack((head, line[begin : i + 1], crossing)), turn[i]))
         head, begin = crossing, i + 1
@@ -93,7 +94,7 @@ def area_geometry(ring: ArrayLike) -> dict[str, Any]:
 def _crossing(a: F8, b: F8, longitude_deg: float) -> F8:
     """(1, k): where the way from a to b meets a meridian, on a straight line of longitude and latitude."""
     along = (longitude_deg - a[0]) / (b[0] - a[0])
-    point = a + along * (b - a)
+    point = np.asarray(a + along * (b - a), float)
     point[0] = longitude_deg
     return point[None]
 

@@ -18,6 +18,8 @@ from scanloom.stages.geometry.se3 import F8
 
 BLOCK = 256
 """Cells along the edge of a block."""
+ACROSS = 1 << 20
+"""More blocks than ever lie beside each other."""
 BLOCKS_IN_MEMORY = 96
 I8 = NDArray[np.int64]
 CELL = np.dtype([("count", "u4"), ("sum", "f8"), ("lowest", "f4"), ("highest", "f4")])
@@ -30,9 +32,9 @@ class Canvas:
     Rows are numbered northwards here: row = floor(y / cell), column = floor(x / cell).
     """
 
-    def __init__(self, folder: Path, cell_m: float, blocks_in_memory: int = BLOCKS_IN_MEMORY) -> None:
+    def __init__(self, folder: Path, cell: float, blocks_in_memory: int = BLOCKS_IN_MEMORY) -> None:
         self.folder = folder
-        self.cell_m = cell_m
+        self.cell = cell
         self._limit = blocks_in_memory
         self._blocks: OrderedDict[tuple[int, int], NDArray[np.void]] = OrderedDict()
         self._spilled: set[tuple[int, int]] = set()
@@ -53,22 +55,40 @@ class Canvas:
 
     def cells_of(self, xy: F8) -> I8:
         """Row and column (n, 2) of points (n, 2)."""
-        return np.floor(xy[:, ::-1] / self.cell_m).astype(np.int64)
+        return np.asarray(np.floor(xy[:, ::-1] / self.cell), np.int64)
 
     def paint(self, xy: F8, values: F8) -> None:
-        """Add values (n,) at places (n, 2), metres."""
+        """Add values (n,) at places (n, 2), metres; in their order, so that sums are the same on every machine."""
         if not len(xy):
             return
         cells = self.cells_of(xy)
         self._grow(cells)
-        for key, chosen in _by_block(cells):
-            block = self._block(key)
-            row, column = (cells[chosen] - BLOCK * np.array(key)).T
-            taken = values[chosen]
-            np.add.at(block["count"], (row, column), 1)
-            np.add.at(block["sum"], (row, column), taken)
-            np.minimum.at(block["lowest"], (row, column), taken.astype(np.float32))
-            np.maximum.at(block["highest"], (row, column), taken.astype(np.float32))
+        first = cells.min(axis=0) // BLOCK
+        keys = _keys(cells, first)
+        order = np.argsort(keys, kind="stable")
+        keys, taken = keys[order], values[order]
+        starts = _starts(keys)
+        counts = np.diff(np.append(starts, len(keys)))
+        sums = np.add.reduceat(taken, starts)
+        lowest, highest = (f.reduceat(taken, starts).astype(np.float32) for f in (np.minimum, np.maximum))
+        for block, at, run in self._runs(keys[starts], first):
+            block["count"][at] += counts[run].astype(np.uint32)
+            block["sum"][at] += sums[run]
+            block["lowest"][at] = np.minimum(block["lowest"][at], lowest[run])
+            block["highest"][at] = np.maximum(block["highest"][at], highest[run])
+
+    def highest_at(self, xy: F8) -> NDArray[np.float32]:
+        """The highest value (n,) of the cells around places (n, 2); minus infinity where there is none."""
+        found = np.full(len(xy), -np.inf, np.float32)
+        if not len(xy):
+            return found
+        cells = self.cells_of(xy)
+        first = cells.min(axis=0) // BLOCK
+        keys, which = np.unique(_keys(cells, first), return_inverse=True)
+        highest = np.empty(len(keys), np.float32)
+        for block, at, run in self._runs(keys, first):
+            highest[run] = block["highest"][at]
+        return np.asarray(highest[which], np.float32)
 
     def window(self, row: int, column: int, rows: int, columns: int) -> NDArray[np.void]:
         """Cells (rows, columns) from a first row and column on, row by row northwards; copied."""
@@ -85,13 +105,13 @@ class Canvas:
                 out[top - row : bottom - row, left - column : right - column] = part
         return out
 
-    def highest_at(self, cells: I8) -> NDArray[np.float32]:
-        """The highest value (n,) of each cell (n, 2); minus infinity where there is none."""
-        found = np.full(len(cells), -np.inf, np.float32)
-        for key, chosen in _by_block(cells):
-            row, column = (cells[chosen] - BLOCK * np.array(key)).T
-            found[chosen] = self._block(key)["highest"][row, column]
-        return found
+    def _runs(self, keys: I8, first: I8) -> Iterator[tuple[NDArray[np.void], I8, slice]]:
+        """Of ascending keys: each block, flat, the cells in it, and which of the keys they are."""
+        starts = _starts(keys // BLOCK**2)
+        for begin, end in zip(starts, np.append(starts[1:], len(keys)), strict=True):
+            row, column = divmod(int(keys[begin]) // BLOCK**2, ACROSS)
+            block = self._block((int(first[0]) + row, int(first[1]) + column))
+            yield block.reshape(-1), keys[begin:end] % BLOCK**2, slice(int(begin), int(end))
 
     def _grow(self, cells: I8) -> None:
         low, high = cells.min(axis=0), cells.max(axis=0)
@@ -121,10 +141,13 @@ def blank(shape: tuple[int, int]) -> NDArray[np.void]:
     return cells
 
 
-def _by_block(cells: I8) -> Iterator[tuple[tuple[int, int], I8]]:
-    """Each block that cells (n, 2) lie in, and which of them do, in their order."""
-    keys, which = np.unique(cells // BLOCK, axis=0, return_inverse=True)
-    order = np.argsort(which.ravel(), kind="stable")
-    ends = np.cumsum(np.bincount(which.ravel(), minlength=len(keys)))
-    for key, chosen in zip(keys, np.split(order, ends[:-1]), strict=True):
-        yield (int(key[0]), int(key[1])), chosen
+def _keys(cells: I8, first: I8) -> I8:
+    """One number per cell (n, 2): its block, counted from a first one, then row and column in the block."""
+    row, column = (cells // BLOCK - first).T
+    inner_row, inner_column = (cells % BLOCK).T
+    return np.asarray(((row * ACROSS + column) * BLOCK + inner_row) * BLOCK + inner_column, np.int64)
+
+
+def _starts(ascending: I8) -> I8:
+    """Where each run of equal numbers begins."""
+    return np.flatnonzero(np.diff(ascending, prepend=ascending[0] - 1))

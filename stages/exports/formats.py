@@ -15,8 +15,15 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from scanloom.schemas.errors import UsageError
+from scanloom.stages.exports.dem import write_dem
+from scanloom.stages.exports.geojson import write_geojson
+from scanloom.stages.exports.geoparquet import write_geoparquet
+from scanloom.stages.exports.gpx import write_gpx
 from scanloom.stages.exports.options import Options
+from scanloom.stages.exports.orthophoto import write_orthophoto
 from scanloom.stages.exports.source import MapSource
+from scanloom.stages.exports.stac import write_stac
+from scanloom.stages.exports.trajectory import write_kitti, write_tum
 
 Write = Callable[[MapSource, Path, Options], list[Path]]
 
@@ -36,7 +43,23 @@ class Format:
     """Raised when the same map would give other files: old exports are then made anew."""
 
 
-_ROWS: tuple[Format, ...] = ()
+_ROWS: tuple[Format, ...] = (
+    Format("tum", "trajectory as text of TUM, in the map's frame", write_tum),
+    Format(
+        "kitti", "trajectory as text of KITTI: 3 x 4 matrices of the LiDAR, in the map's frame", write_kitti
+    ),
+    Format("gpx", "trajectory as GPX 1.1", write_gpx),
+    Format("geojson", "trajectory as GeoJSON", write_geojson),
+    Format(
+        "geoparquet",
+        "trajectory as GeoParquet 1.1, a row per scan with standard deviations",
+        write_geoparquet,
+    ),
+    Format("dem", "heights of the ground as GeoTIFF", write_dem, "raster", ("rasterio",)),
+    Format("orthophoto", "intensity from above as GeoTIFF", write_orthophoto, "raster", ("rasterio",)),
+    Format("stac", "catalogue item of the map and all its exports", write_stac, "stac", ("pystac",)),
+)
+"""In the order in which they are written when all are asked for; the catalogue last, since it lists the others."""
 
 FORMATS: Mapping[str, Format] = {row.name: row for row in _ROWS}
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from scanloom.schemas.trajectory import Poses
+from scanloom.stages.exports.coordinates import Projector
+from scanloom.stages.exports.options import Options
 from scanloom.stages.exports.source import MapSource
+from scanloom.stages.exports.wgs84 import places
 from scanloom.stages.geometry.se3 import F8, quaternion_from_matrix
 
 VERSION = "1.1.0"
@@ -18,26 +20,29 @@ WKB_POINT_Z = 1001
 """ISO code of a point with a third coordinate."""
 
 
-def write_geoparquet(
-    source: MapSource, folder: Path, project: Callable[[F8], F8], crs: dict[str, Any] | None
-) -> list[Path]:
-    """`trajectory.parquet`; a row group per session, positions as WKB points with z.
+def write_geoparquet(source: MapSource, folder: Path, options: Options) -> list[Path]:
+    """`trajectory.parquet`; a row group per session, positions as WKB points with z in the projected system.
 
-    project : from the map's frame (n, 3) into x, y, z of the system `crs`.
-    crs : PROJJSON; None for a map that stands nowhere on the Earth, which the file then says (`"crs": null`).
+    A map without georeference keeps its own coordinates, and the file says that they are of no known system
+    (`"crs": null`).
+
+    Raises
+    ------
+    UsageError : the system asked for is not known, or its grid is not installed.
     """
     import pyarrow.parquet as pq
 
+    projector = Projector.of(source, options)
+    crs = None if projector.crs is None else projector.crs.to_json_dict()
     sessions = {
-        name: (poses, project(poses.T_world_lidar[:, :3, 3])) for name, poses in source.trajectories().items()
+        name: (poses, projector.project(places(poses))) for name, poses in source.trajectories().items()
     }
     positions = np.vstack([np.empty((0, 3)), *(p for _, p in sessions.values())])
-    folder.mkdir(parents=True, exist_ok=True)
     path = folder / "trajectory.parquet"
     schema = _schema(_metadata(positions, crs))
     with pq.ParquetWriter(path, schema, compression="zstd") as writer:
-        for name, (poses, places) in sessions.items():
-            writer.write_table(_table(name, poses, places, schema))
+        for name, (poses, at) in sessions.items():
+            writer.write_table(_table(name, poses, at, schema))
     return [path]
 
 

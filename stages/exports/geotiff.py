@@ -38,7 +38,8 @@ class Layer:
 class Lattice:
     """Where the cells lie. Rows run southwards, as in the file; row 0 is the northernmost."""
 
-    cell_m: float
+    cell: float
+    """Edge of a cell in units of the system."""
     west: int
     """Columns from the origin of the coordinate system to the left edge."""
     north: int
@@ -72,7 +73,6 @@ def write_geotiffs(
     import rasterio
     from rasterio.shutil import copy
 
-    folder.mkdir(parents=True, exist_ok=True)
     targets = [folder / f"{layer.name}.tif" for layer in layers]
     with (
         rasterio.Env(GDAL_CACHEMAX=CACHE_MB, GDAL_NUM_THREADS=1),
@@ -114,7 +114,7 @@ def _draft(path: Path, lattice: Lattice, layer: Layer) -> Any:
     import rasterio
     from rasterio.transform import from_origin
 
-    cell = lattice.cell_m
+    cell = lattice.cell
     file = rasterio.open(
         path, "w", driver="GTiff", width=lattice.columns, height=lattice.rows, count=1, dtype=layer.dtype,
         nodata=layer.nodata, crs=lattice.crs, tiled=True, blockxsize=TILE, blockysize=TILE, SPARSE_OK=True,

@@ -9,20 +9,35 @@ import numpy as np
 
 from scanloom.schemas.trajectory import Poses
 from scanloom.stages.exports.antimeridian import wrapped
-from scanloom.stages.exports.geojson import DEGREE_DECIMALS, METRE_DECIMALS, utc
+from scanloom.stages.exports.coordinates import Projector
+from scanloom.stages.exports.options import Options
 from scanloom.stages.exports.source import MapSource
+from scanloom.stages.exports.wgs84 import (
+    DEGREE_DECIMALS,
+    METRE_DECIMALS,
+    geodetic,
+    origin_of,
+    places,
+    utc,
+)
 from scanloom.stages.geometry.se3 import F8
 
 NAMESPACE = "http://www.topografix.com/GPX/1/1"
 INSTANCE = "http://www.w3.org/2001/XMLSchema-instance"
 
 
-def write_gpx(source: MapSource, folder: Path, positions: dict[str, F8], heights: str) -> list[Path]:
+def write_gpx(source: MapSource, folder: Path, options: Options) -> list[Path]:
     """`trajectory.gpx`, a point per scan with height and time.
 
-    positions : longitude, latitude, height (n, 3) of each session's poses, degrees and m.
-    heights : what they are counted from, in words; GPX itself leaves it open, and most programs take sea level.
+    GPX leaves open what elevations are counted from, and most programs take sea level; the file's description says it.
+
+    Raises
+    ------
+    InvalidInput : the map has no georeference.
+    UsageError : the grid for orthometric heights is not installed.
     """
+    origin = origin_of(source, "gpx")
+    projector = Projector.of(source, options)
     root = ET.Element(
         "gpx",
         {
@@ -35,11 +50,12 @@ def write_gpx(source: MapSource, folder: Path, positions: dict[str, F8], heights
     )
     about = ET.SubElement(root, "metadata")
     _text(about, "name", source.name)
-    _text(about, "desc", f"Positions of the LiDAR, WGS84. Elevations: {heights}.")
+    _text(about, "desc", f"Positions of the LiDAR, WGS84. Elevations: {projector.heights}.")
     for session, poses in source.trajectories().items():
-        _track(root, session, poses, positions[session])
+        positions = geodetic(origin, places(poses))
+        positions[:, 2] = projector.project(places(poses))[:, 2]
+        _track(root, session, poses, positions)
     ET.indent(root, " ")
-    folder.mkdir(parents=True, exist_ok=True)
     path = folder / "trajectory.gpx"
     ET.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
     return [path]

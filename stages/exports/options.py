@@ -27,3 +27,7 @@ class Options(BaseModel):
         False, description="whether points that are left out of the map come too, with their classes"
     )
     per_tile: bool = Field(False, description="whether LAZ has one file per tile besides the whole map")
+    cell_m: float = Field(0.25, ge=0.01, le=100.0, description="edge of a cell of rasters, m")
+    fill_cells: int = Field(
+        4, ge=0, le=40, description="cells up to which ground heights are interpolated into holes"
+    )

@@ -6,20 +6,21 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
-from scanloom.schemas.errors import UsageError
+from scanloom.schemas.errors import InvalidInput
 from scanloom.schemas.frames import Georeference
 from scanloom.schemas.product import columns_of
 from scanloom.schemas.tiles import Tile
 from scanloom.stages.exports.antimeridian import area_geometry, bounding_box
+from scanloom.stages.exports.coordinates import Projector
+from scanloom.stages.exports.options import Options
 from scanloom.stages.exports.source import MapSource
+from scanloom.stages.exports.wgs84 import moment, origin_of
 from scanloom.stages.geometry.geodesy import world_to_geodetic
 from scanloom.stages.geometry.se3 import F8
 
@@ -60,37 +61,24 @@ DELIVERED = {
 }
 
 
-@dataclass(frozen=True)
-class System:
-    """The projected system the exported files are in."""
+def write_stac(source: MapSource, folder: Path, options: Options) -> list[Path]:
+    """`item.json`: the map's footprint, its times, its point cloud, and an asset for every file of the other exports.
 
-    code: str | None
-    """As `EPSG:32632`; None when it has none."""
-    projjson: dict[str, Any]
-    bounds: F8
-    """West, south, lowest, east, north, highest of the map in it."""
-
-
-def write_stac(source: MapSource, folder: Path, exports: Path, system: System) -> list[Path]:
-    """`item.json`: the map's footprint, its times, its point cloud and an asset for every file below `exports`.
+    The exports are those that lie beside `folder` when this one is written.
 
     Raises
     ------
-    UsageError : the map is not georeferenced, or holds nothing.
+    InvalidInput : the map has no georeference, no points or no trajectory.
+    UsageError : the system asked for is not known, or its grid is not installed.
     """
-    origin = source.georeference
-    if origin is None or not source.points:
-        raise UsageError(
-            "is not georeferenced" if source.points else "holds no points",
-            where=str(source.folder),
-            next_step="leave stac out of --format: a catalogue lists maps by their place on the Earth",
-        )
     import pystac
 
+    origin = origin_of(source, "stac")
+    projector = Projector.of(source, options)
+    start, end = (moment(stamp) for stamp in _times(source))
     ring = footprint(source, origin)
     heights = world_to_geodetic(origin, _corners(source))[:, 2]
     (west, south, east, north), low, high = bounding_box(ring), heights.min(), heights.max()
-    start, end = (_moment(s) for s in _times(source))
     item = pystac.Item(
         id=source.name,
         geometry=area_geometry(ring),
@@ -98,13 +86,12 @@ def write_stac(source: MapSource, folder: Path, exports: Path, system: System) -
         datetime=start,
         start_datetime=start,
         end_datetime=end,
-        properties=_properties(source, system),
+        properties=_properties(source, projector),
         stac_extensions=list(EXTENSIONS.values()),
     )
-    for key, asset in _assets(source.folder, exports, folder):
+    for key, asset in _assets(source.folder, folder):
         item.add_asset(key, asset)
     path = folder / ITEM
-    folder.mkdir(parents=True, exist_ok=True)
     content = item.to_dict(include_self_link=False)
     path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return [path]
@@ -154,26 +141,29 @@ def _corners(source: MapSource) -> F8:
 
 def _times(source: MapSource) -> tuple[int, int]:
     """First and last stamp of all poses, ns."""
+    if not source.points:
+        raise InvalidInput(
+            "holds no points, so that it lies nowhere",
+            where=str(source.folder),
+            next_step="leave stac out of --format",
+        )
     stamps = [p.stamp_ns for p in source.trajectories().values() if len(p)]
     if not stamps:
-        raise UsageError(
+        raise InvalidInput(
             "has no trajectory, so that nobody knows when it was measured",
             where=str(source.folder),
-            next_step="leave stac out of --format, or map the sessions again",
+            next_step="leave stac out of --format",
         )
     return min(int(s.min()) for s in stamps), max(int(s.max()) for s in stamps)
 
 
-def _moment(stamp_ns: int) -> datetime:
-    return datetime.fromtimestamp(0, UTC) + timedelta(microseconds=stamp_ns // 1000)
-
-
-def _properties(source: MapSource, system: System) -> dict[str, Any]:
+def _properties(source: MapSource, projector: Projector) -> dict[str, Any]:
+    corners = projector.project(_corners(source))
     return {
         "title": source.name,
-        "proj:code": system.code,
-        "proj:projjson": system.projjson,
-        "proj:bbox": [float(v) for v in system.bounds],
+        "proj:code": f"EPSG:{projector.epsg}",
+        "proj:projjson": projector.crs.to_json_dict(),
+        "proj:bbox": [*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist()],
         "pc:count": source.points,
         "pc:type": "lidar",
         "pc:encoding": "Parquet",
@@ -194,20 +184,30 @@ def point_schema() -> list[dict[str, Any]]:
     return rows
 
 
-def _assets(map_folder: Path, exports: Path, item_folder: Path) -> Iterator[tuple[str, Any]]:
+def _assets(map_folder: Path, item_folder: Path) -> Iterator[tuple[str, Any]]:
     """Key and asset of each delivered and each exported file, in order."""
-    for name, (title, roles) in DELIVERED.items():
-        if (map_folder / name).is_file():
-            yield name, _asset(map_folder / name, item_folder, title, roles)
-    for path in sorted(p for p in exports.rglob("*") if p.is_file()):
-        name = path.relative_to(exports)
-        if item_folder in path.parents or any(part.startswith(".") for part in name.parts):
-            continue
-        kind = "metadata" if path.suffix in {".txt", ".yaml"} else "data"
+    for delivered, (title, roles) in DELIVERED.items():
+        if (map_folder / delivered).is_file():
+            yield delivered, _asset(map_folder / delivered, item_folder, title, roles)
+    for path in exported_files(item_folder.parent):
+        name = path.relative_to(item_folder.parent)
+        role = "metadata" if path.suffix in {".txt", ".yaml"} else "data"
         yield (
             f"exports/{name.as_posix()}",
-            _asset(path, item_folder, f"{name.parts[0]}: {name.name}", [kind]),
+            _asset(path, item_folder, f"{name.parts[0]}: {name.name}", [role]),
         )
+
+
+def exported_files(exports: Path) -> list[Path]:
+    """Files of all finished exports in a folder but the catalogue's own."""
+    from scanloom.stages.exports.formats import FORMATS  # which knows this module
+
+    found: list[Path] = []
+    for export in sorted(
+        p for p in exports.iterdir() if p.is_dir() and p.name in FORMATS and p.name != "stac"
+    ):
+        found += sorted(p for p in export.rglob("*") if p.is_file())
+    return found
 
 
 def _asset(path: Path, item_folder: Path, title: str, roles: list[str]) -> Any:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from scanloom.schemas.trajectory import Poses
+from scanloom.stages.exports.options import Options
 from scanloom.stages.exports.source import MapSource
 from scanloom.stages.geometry.se3 import quaternion_from_matrix
 
@@ -22,14 +23,14 @@ multiply with the calibration Tr (LiDAR into camera): T_cam0_cam(i) = Tr T_map_l
 """
 
 
-def write_tum(source: MapSource, folder: Path) -> list[Path]:
+def write_tum(source: MapSource, folder: Path, options: Options) -> list[Path]:
     """`SESSION.tum`, lines of `stamp tx ty tz qx qy qz qw`: seconds with nanoseconds, metres, unit quaternion."""
     return [
         _lines(folder / f"{session}.tum", _tum(poses)) for session, poses in source.trajectories().items()
     ]
 
 
-def write_kitti(source: MapSource, folder: Path) -> list[Path]:
+def write_kitti(source: MapSource, folder: Path, options: Options) -> list[Path]:
     """`SESSION.txt`, lines of twelve numbers, `SESSION_times.txt` and a note that says which frames these are."""
     written = []
     for session, poses in source.trajectories().items():
@@ -64,7 +65,6 @@ def _kitti(poses: Poses) -> Iterator[str]:
 
 
 def _lines(path: Path, lines: Iterator[str] | list[str]) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", encoding="utf-8", newline="\n") as stream:
         stream.writelines(f"{line}\n" for line in lines)
     return path

@@ -1,0 +1,79 @@
+"""Intensity of the map seen from above, as cloud-optimized GeoTIFFs."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.schemas.scans import PointClass
+from scanloom.stages.exports.canvas import Canvas
+from scanloom.stages.exports.geotiff import Layer, Window, write_geotiffs
+from scanloom.stages.exports.options import Options
+from scanloom.stages.exports.raster import Ground, cells_in, mean_of
+from scanloom.stages.exports.source import MapSource
+
+TOP_M = 0.3
+"""Points less than this below the highest of their cell are seen from above."""
+NUMBERS = 65535
+"""Numbers of 16 bits but 0, which means that nothing was measured."""
+
+
+def write_orthophoto(source: MapSource, folder: Path, options: Options) -> list[Path]:
+    """Mean intensity per cell: `intensity_top.tif` of what is seen from above, `intensity_ground.tif` of the ground.
+
+    Numbers are 16 bit, 0 where there is nothing; intensity = offset + scale * number, with offset and scale of the band
+    as GDAL keeps them: the lowest intensity (or 0) has number 1, the highest 65535. Intensities are as the sensor gave
+    them: not corrected for distance or angle.
+
+    Raises
+    ------
+    InvalidInput : the map has no points.
+    UsageError : the system asked for is not known.
+    """
+    ground = Ground.of(source, options)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".cells-") as scratch:
+        heights, top, road = (_canvas(Path(scratch) / name, ground.cell) for name in ("z", "top", "road"))
+        low, high = 0.0, 0.0
+        for tile, points in ground.tiles():
+            heights.paint(points[:, :2], points[:, 2])
+            low = min(low, float(tile.intensity.min(initial=0.0)))
+            high = max(high, float(tile.intensity.max(initial=0.0)))
+        lattice = ground.lattice(heights, "points")
+        for tile, points in ground.tiles():
+            intensity = tile.intensity.astype(np.float64)
+            seen = points[:, 2] > heights.highest_at(points[:, :2]) - TOP_M
+            top.paint(points[seen, :2], intensity[seen])
+            low_lying = tile.class_ == PointClass.GROUND
+            road.paint(points[low_lying, :2], intensity[low_lying])
+        scale = (high - low) / (NUMBERS - 1) or 1.0
+
+        def numbers(window: Window) -> list[NDArray[Any]] | None:
+            cells = [cells_in(canvas, lattice, window) for canvas in (top, road)]
+            if not any(part["count"].any() for part in cells):
+                return None
+            return [_numbers(part, low, scale)[::-1] for part in cells]
+
+        return write_geotiffs(folder, lattice, _layers(scale, low - scale), numbers)
+
+
+def _canvas(folder: Path, cell: float) -> Canvas:
+    folder.mkdir()
+    return Canvas(folder, cell)
+
+
+def _numbers(cells: NDArray[np.void], low: float, scale: float) -> NDArray[np.uint16]:
+    number = 1.0 + np.rint((mean_of(cells) - low) / scale)
+    return np.where(cells["count"] > 0, np.clip(number, 1, NUMBERS), 0).astype(np.uint16)
+
+
+def _layers(scale: float, offset: float) -> list[Layer]:
+    tags = {"INTENSITY": "as the sensor gave it, not corrected for distance or angle"}
+    docs = {
+        "intensity_top": f"mean intensity of the points less than {TOP_M} m below the highest",
+        "intensity_ground": "mean intensity of the ground points",
+    }
+    return [Layer(name, "uint16", 0, "1", doc, scale, offset, tags) for name, doc in docs.items()]
