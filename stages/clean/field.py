@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,40 +19,76 @@ U1 = NDArray[np.uint8]
 FIRST_BRICKS = 1 << 12
 SATURATED = 255
 
-BLOCKED, PASSED, HIT, TRACKED_HIT, HITS, TRACKED, BEFORE, BETWEEN, AFTER = range(9)
-"""Layers of a brick: bins that last blocked, passed and hit a voxel, the last also of what is tracked; counts of bins as in
-`schemas.clean.Rays`."""
-LAYERS = 9
+HIT, MOVED, BLOCKED, MET, PASSED = 1, 2, 4, 8, 16
+"""What the present bin says of a voxel: a return lies in it, one of what is tracked, a return lies in or beside it, those
+beside it are blocked already, a ray passes."""
+HITS, TRACKED, BEFORE, BETWEEN, AFTER = range(5)
+"""Layers of a brick: counts of bins as in `schemas.clean.Rays`."""
+LAYERS = 5
 
 
 class Field:
-    """Bricks by key. `voxels` (bricks, LAYERS, 512) holds stamps and counts; it grows when `full`."""
+    """Bricks by key. `now` (bricks, 512) holds flags of the present bin, `counts` (bricks, LAYERS, 512) those of all before;
+    they grow when full."""
 
     def __init__(self) -> None:
         self.count = np.zeros(1, np.int64)
         self.order = np.empty(FIRST_BRICKS, np.int64)
-        self.voxels = np.zeros((FIRST_BRICKS, LAYERS, BRICK_VOXELS), np.uint8)
+        self.now = np.zeros((FIRST_BRICKS, BRICK_VOXELS), np.uint8)
+        self.counts = np.zeros((FIRST_BRICKS, LAYERS, BRICK_VOXELS), np.uint8)
         self.keys, self.rows = brick_table(self.order[:0], FIRST_BRICKS)
 
     def grow(self) -> None:
         """Twice the room."""
         more = 2 * len(self.order)
         n = int(self.count[0])
-        order, voxels = np.empty(more, np.int64), np.zeros((more, *self.voxels.shape[1:]), np.uint8)
-        order[:n], voxels[:n] = self.order[:n], self.voxels[:n]
-        self.order, self.voxels = order, voxels
+        self.order, self.now, self.counts = (_roomy(a, n, more) for a in (self.order, self.now, self.counts))
         self.keys, self.rows = brick_table(self.bricks, more)
 
-    def stamp(self, bin_: int) -> int:
-        """Stamp, 1 to 255, of a bin, counted from 1; stamps that come round again are wiped first."""
-        if bin_ > 1 and bin_ % SATURATED == 1:
-            self.voxels[:, : TRACKED_HIT + 1] = 0
-        return 1 + (bin_ - 1) % SATURATED
+    def settle(self) -> None:
+        """Count what the present bin says, and begin the next."""
+        n = int(self.count[0])
+        settle(self.now[:n], self.now[:n].view(np.uint64), self.counts[:n])
 
     @property
     def bricks(self) -> I8:
         """Keys (n,) in the order in which they were met."""
         return self.order[: int(self.count[0])]
+
+
+def _roomy(array: NDArray[Any], used: int, room: int) -> NDArray[Any]:
+    out = np.zeros((room, *array.shape[1:]), array.dtype)
+    out[:used] = array[:used]
+    return out
+
+
+@kernel
+def settle(now: U1, eights: NDArray[np.uint64], counts: NDArray[np.uint8]) -> None:
+    """Add a bin's flags (bricks, 512) to the counts and wipe them; `eights` (bricks, 64) are the same flags, eight at once."""
+    for n in range(len(now)):
+        for e in range(eights.shape[1]):
+            if eights[n, e] == 0:
+                continue
+            for q in range(8 * e, 8 * e + 8):
+                if now[n, q]:
+                    _count(now[n, q], counts[n], q)
+            eights[n, e] = 0
+
+
+@kernel
+def _count(said: Int, brick: U1, q: int) -> None:
+    if said & HIT:
+        if brick[HITS, q] > 0:
+            brick[BETWEEN, q] = min(SATURATED, np.int64(brick[BETWEEN, q]) + brick[AFTER, q])
+            brick[AFTER, q] = 0
+        if brick[HITS, q] < SATURATED:
+            brick[HITS, q] += 1
+        if said & MOVED and brick[TRACKED, q] < SATURATED:
+            brick[TRACKED, q] += 1
+    if said & PASSED and not said & BLOCKED:
+        counted = AFTER if brick[HITS, q] > 0 else BEFORE
+        if brick[counted, q] < SATURATED:
+            brick[counted, q] += 1
 
 
 def brick_table(bricks: I8, room: int) -> tuple[I8, I4]:

@@ -1,8 +1,8 @@
 """Rays: what the scans of one chunk say of the free space around them, voxel by voxel and tile by tile.
 
 Scans are taken together in bins of a fraction of a second. Each return marks its voxel and blocks those around it for its
-bin; then the rays of a scan in its middle are walked from the sensor to well before their returns, and what they pass unblocked
-was free in this bin.
+bin; then the rays of a scan in its middle are walked from the sensor, where they lie closer together than voxels only one of
+them, to well before their returns, and what they pass unblocked was free in this bin.
 Poses are those of the finished map. Source: methods 1.5.1 and 1.5.2 (occupancy by rays), with two differences: bins instead
 of log-odds, so that what stood for long and then left is told from what is half transparent; and the blocked neighbourhood,
 which takes up errors of poses and ranges.
@@ -23,6 +23,7 @@ from scanloom.schemas.trajectory import Poses
 from scanloom.stages.clean import incidence
 from scanloom.stages.clean.field import AFTER, BEFORE, BETWEEN, HITS, TRACKED
 from scanloom.stages.clean.field import Field as VoxelField
+from scanloom.stages.clean.leading import followed_since
 from scanloom.stages.clean.moving import MovingBoxes, boxed
 from scanloom.stages.clean.tiles import bricks_by_tile
 from scanloom.stages.clean.walking import mark_hits, walk
@@ -70,7 +71,7 @@ def rays(
     """
     T_of = {int(i): T for i, T in zip(poses.scan_index, poses.T_world_lidar) if np.isfinite(T).all()}
     field, image, first_ns, moving = VoxelField(), incidence.new_image(), 0, MovingBoxes(tracks)
-    for number, pairs in enumerate(_bins(deskewed, labels, settings.bin_s), start=1):
+    for pairs in _bins(deskewed, labels, settings.bin_s):
         first_ns = first_ns or pairs[0][0].reference_ns
         placed = [
             (
@@ -80,7 +81,8 @@ def rays(
             for scan, label in pairs
             if scan.scan_index in T_of
         ]
-        _mark(settings, field, image, field.stamp(number), placed)
+        _mark(settings, field, image, placed)
+        field.settle()
     yield from _parts(settings, field, first_ns, poses.frame)
 
 
@@ -103,26 +105,25 @@ def _seen(scan: DeskewedScan, label: ScanLabels, tracked: np.ndarray) -> tuple[n
     return tuple(np.ascontiguousarray(c[rows]) for c in (scan.x_m, scan.y_m, scan.z_m, label.class_, moved))
 
 
-def _mark(settings: Settings, field: VoxelField, image: np.ndarray, bin_: int, placed: list[tuple]) -> None:
+def _mark(settings: Settings, field: VoxelField, image: np.ndarray, placed: list[tuple]) -> None:
     """All returns of a bin before the rays of its middle: a return of one scan blocks the rays of the others."""
     for x, y, z, classes, moved, T in placed:
         _until_done(
-            field,
-            mark_hits,
-            (x, y, z, classes, moved, T, bin_, settings.reach_m, settings.voxel_size_m),
-            len(x),
+            field, mark_hits, (x, y, z, classes, moved, T, settings.reach_m, settings.voxel_size_m), len(x)
         )
     spare = max(len(placed) - settings.walked_scans, 0)
     for x, y, z, _, _, T in placed[spare // 2 : len(placed) - (spare - spare // 2)]:
-        clear = incidence.clear_ranges(x, y, z, incidence.fill(x, y, z, image), image, settings.clearance_m)
-        _until_done(field, walk, (x, y, z, clear, T, bin_, settings.reach_m, settings.voxel_size_m), len(x))
+        cell = incidence.fill(x, y, z, image)
+        clear = incidence.clear_ranges(x, y, z, cell, image, settings.clearance_m)
+        since = followed_since(cell, clear, settings.voxel_size_m)
+        _until_done(field, walk, (x, y, z, since, clear, T, settings.reach_m, settings.voxel_size_m), len(x))
 
 
 def _until_done(field: VoxelField, kernel: object, arguments: tuple, count: int) -> None:
     """Go on where the field was full, with more room."""
     done = 0
     while True:
-        done = kernel(*arguments, done, field.keys, field.rows, field.order, field.count, field.voxels)  # type: ignore[operator]
+        done = kernel(*arguments, done, field.keys, field.rows, field.order, field.count, field.now)  # type: ignore[operator]
         if done == count:
             return
         field.grow()
@@ -131,7 +132,7 @@ def _until_done(field: VoxelField, kernel: object, arguments: tuple, count: int)
 def _parts(settings: Settings, field: VoxelField, first_ns: int, frame: str) -> Iterator[Part[Rays]]:
     brick_m = BRICK_SIDE * settings.voxel_size_m
     for name, rows in bricks_by_tile(field.bricks, brick_m, settings.tile_size_m, settings.voxel_size_m):
-        layers = field.voxels[rows]
+        layers = field.counts[rows]
         yield Part(
             Rays(
                 brick=field.bricks[rows],

@@ -7,18 +7,13 @@ from numpy.typing import NDArray
 
 from scanloom.schemas.scans import PointClass
 from scanloom.stages.clean.field import (
-    AFTER,
-    BEFORE,
-    BETWEEN,
     BLOCKED,
     HIT,
-    HITS,
     I4,
     I8,
+    MET,
+    MOVED,
     PASSED,
-    SATURATED,
-    TRACKED,
-    TRACKED_HIT,
     U1,
     brick_key,
     inner,
@@ -37,43 +32,39 @@ NEAREST_M = 1.0
 
 @kernel
 def mark_hits(
-    x: F4, y: F4, z: F4, classes: U1, tracked: NDArray[np.bool_], T: F8, bin_: Int, reach_m: float, voxel_m: float, start: Int,
-    keys: I8, rows: I4, order: I8, count: I8, voxels: NDArray[np.uint8],
+    x: F4, y: F4, z: F4, classes: U1, tracked: NDArray[np.bool_], T: F8, reach_m: float, voxel_m: float, start: Int,
+    keys: I8, rows: I4, order: I8, count: I8, now: U1,
 ) -> int:  # fmt: skip
     """Mark the voxels of the returns from number `start` on, and those around them as blocked for this bin.
 
     Returns len(x), or the number of the return at which the field was full.
     """
     per_m = 1.0 / voxel_m
+    last: Int = EMPTY
+    row: Int = 0
     for n in range(start, len(x)):
         px, py, pz = float(x[n]), float(y[n]), float(z[n])
         i, j, k = voxel_at(px, py, pz, T, per_m)
-        row = row_made(keys, rows, order, count, brick_key(i, j, k))
-        if row < 0:
-            return n
-        brick = voxels[row]
+        key = brick_key(i, j, k)
+        if key != last:
+            row = row_made(keys, rows, order, count, key)
+            last = key
+            if row < 0:
+                return n
         q = inner(i, j, k)
-        if classes[n] != GROUND and brick[HIT, q] != bin_:
-            brick[HIT, q] = bin_
-            if brick[HITS, q] > 0:
-                brick[BETWEEN, q] = min(SATURATED, np.int64(brick[BETWEEN, q]) + brick[AFTER, q])
-                brick[AFTER, q] = 0
-            if brick[HITS, q] < SATURATED:
-                brick[HITS, q] += 1
-        if tracked[n] and classes[n] != GROUND and brick[TRACKED_HIT, q] != bin_:
-            brick[TRACKED_HIT, q] = bin_
-            if brick[TRACKED, q] < SATURATED:
-                brick[TRACKED, q] += 1
-        if px * px + py * py + pz * pz > reach_m * reach_m:
+        if classes[n] != GROUND:
+            now[row, q] |= (HIT | MOVED) if tracked[n] else HIT
+        if now[row, q] & MET or px * px + py * py + pz * pz > reach_m * reach_m:
             continue
-        if not _block(i, j, k, bin_, row, keys, rows, order, count, voxels):
+        if not _block(i, j, k, row, keys, rows, order, count, now):
             return n
+        now[row, q] |= MET
     return len(x)
 
 
 @kernel
 def _block(
-    i: Int, j: Int, k: Int, bin_: Int, row: Int, keys: I8, rows: I4, order: I8, count: I8, voxels: NDArray[np.uint8]
+    i: Int, j: Int, k: Int, row: Int, keys: I8, rows: I4, order: I8, count: I8, now: U1
 ) -> bool:  # fmt: skip
     """Block a voxel and the 26 around it for this bin; False when the field is full."""
     u, v, w = i & 7, j & 7, k & 7
@@ -81,9 +72,9 @@ def _block(
         for a in range(u - 1, u + 2):
             for b in range(v - 1, v + 2):
                 at = (a << 6) | (b << 3) | w
-                voxels[row, BLOCKED, at - 1] = bin_
-                voxels[row, BLOCKED, at] = bin_
-                voxels[row, BLOCKED, at + 1] = bin_
+                now[row, at - 1] |= BLOCKED
+                now[row, at] |= BLOCKED
+                now[row, at + 1] |= BLOCKED
         return True
     last: Int = EMPTY
     at_row: Int = row
@@ -96,16 +87,16 @@ def _block(
                     last = key
                     if at_row < 0:
                         return False
-                voxels[at_row, BLOCKED, inner(a, b, c)] = bin_
+                now[at_row, inner(a, b, c)] |= BLOCKED
     return True
 
 
 @kernel
 def walk(
-    x: F4, y: F4, z: F4, clear_m: F4, T: F8, bin_: Int, reach_m: float, voxel_m: float, start: Int,
-    keys: I8, rows: I4, order: I8, count: I8, voxels: NDArray[np.uint8],
+    x: F4, y: F4, z: F4, since_m: F4, clear_m: F4, T: F8, reach_m: float, voxel_m: float, start: Int,
+    keys: I8, rows: I4, order: I8, count: I8, now: U1,
 ) -> int:  # fmt: skip
-    """Count this bin in every voxel that a ray passes up to `clear_m` (n,) from the sensor and that is not blocked.
+    """Mark every voxel that a ray passes between `since_m` and `clear_m` (n,) from the sensor and that is not blocked.
 
     Voxel by voxel along the ray (Amanatides and Woo 1987). Returns len(x), or the number of the ray at which the field
     was full; that ray may be walked again.
@@ -113,49 +104,48 @@ def walk(
     per_m = 1.0 / voxel_m
     for n in range(start, len(x)):
         end = min(float(clear_m[n]), reach_m)
-        if not end > NEAREST_M:
+        t = max(float(since_m[n]), NEAREST_M)
+        if not end > t:
             continue
         px, py, pz = float(x[n]), float(y[n]), float(z[n])
         r = np.sqrt(px * px + py * py + pz * pz)
         dx = (T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz) / r
         dy = (T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz) / r
         dz = (T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz) / r
-        i = np.int64(np.floor((T[0, 3] + dx * NEAREST_M) * per_m))
-        j = np.int64(np.floor((T[1, 3] + dy * NEAREST_M) * per_m))
-        k = np.int64(np.floor((T[2, 3] + dz * NEAREST_M) * per_m))
-        step_i, to_i, along_i = _axis(T[0, 3], dx, i, voxel_m)
-        step_j, to_j, along_j = _axis(T[1, 3], dy, j, voxel_m)
-        step_k, to_k, along_k = _axis(T[2, 3], dz, k, voxel_m)
-        last: Int = EMPTY
-        row: Int = 0
-        t = NEAREST_M
+        i = np.int64(np.floor((T[0, 3] + dx * t) * per_m))
+        j = np.int64(np.floor((T[1, 3] + dy * t) * per_m))
+        k = np.int64(np.floor((T[2, 3] + dz * t) * per_m))
+        step_i, enter_i, to_i, along_i = _axis(T[0, 3], dx, i, voxel_m)
+        step_j, enter_j, to_j, along_j = _axis(T[1, 3], dy, j, voxel_m)
+        step_k, enter_k, to_k, along_k = _axis(T[2, 3], dz, k, voxel_m)
+        row: Int = -1
         while t < end:
-            key = brick_key(i, j, k)
-            if key != last:
-                row = row_made(keys, rows, order, count, key)
-                last = key
+            if row < 0:
+                row = row_made(keys, rows, order, count, brick_key(i, j, k))
                 if row < 0:
                     return n
             q = inner(i, j, k)
-            if voxels[row, BLOCKED, q] != bin_ and voxels[row, PASSED, q] != bin_:
-                voxels[row, PASSED, q] = bin_
-                counted = AFTER if voxels[row, HITS, q] > 0 else BEFORE
-                if voxels[row, counted, q] < SATURATED:
-                    voxels[row, counted, q] += 1
+            if now[row, q] & (BLOCKED | PASSED) == 0:
+                now[row, q] |= PASSED
             if to_i < to_j and to_i < to_k:
                 t, to_i, i = to_i, to_i + along_i, i + step_i
+                crossed = i & 7 == enter_i
             elif to_j < to_k:
                 t, to_j, j = to_j, to_j + along_j, j + step_j
+                crossed = j & 7 == enter_j
             else:
                 t, to_k, k = to_k, to_k + along_k, k + step_k
+                crossed = k & 7 == enter_k
+            if crossed:
+                row = -1
     return len(x)
 
 
 @kernel
-def _axis(origin: float, direction: float, index: Int, voxel_m: float) -> tuple[int, float, float]:
-    """Step of the index, distance to the first wall, distance between walls along one axis."""
+def _axis(origin: float, direction: float, index: Int, voxel_m: float) -> tuple[int, int, float, float]:
+    """Along one axis: step of the index, place in a brick at which it is entered, distance to the first wall, and between walls."""
     if direction > 0.0:
-        return 1, ((index + 1) * voxel_m - origin) / direction, voxel_m / direction
+        return 1, 0, ((index + 1) * voxel_m - origin) / direction, voxel_m / direction
     if direction < 0.0:
-        return -1, (index * voxel_m - origin) / direction, -voxel_m / direction
-    return 0, np.inf, np.inf
+        return -1, 7, (index * voxel_m - origin) / direction, -voxel_m / direction
+    return 0, -1, np.inf, np.inf

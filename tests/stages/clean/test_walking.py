@@ -10,10 +10,8 @@ from scanloom.stages.clean.field import (
     AFTER,
     BEFORE,
     BETWEEN,
-    BLOCKED,
     FIRST_BRICKS,
     HITS,
-    PASSED,
     SATURATED,
     TRACKED,
     Field,
@@ -22,6 +20,7 @@ from scanloom.stages.clean.field import (
     row_of,
 )
 from scanloom.stages.clean.incidence import clear_ranges, fill, new_image
+from scanloom.stages.clean.leading import CELL_RAD, WIDTH_SHARE, followed_since
 from scanloom.stages.clean.tiles import brick_indices, bricks_by_tile
 from scanloom.stages.clean.walking import NEAREST_M, mark_hits, walk
 from scanloom.stages.geometry.se3 import F8, pose, so3_exp
@@ -35,73 +34,99 @@ def columns(points: F8) -> tuple[np.ndarray, ...]:
     return tuple(np.ascontiguousarray(c) for c in points.astype(np.float32).T)
 
 
-def marked(field: Field, points: F8, bin_: int, T: F8 = ORIGIN, *, moved: bool = False) -> None:
+def marked(field: Field, points: F8, T: F8 = ORIGIN, *, moved: bool = False) -> None:
     n = len(points)
     classes = np.full(n, PointClass.STATIC, np.uint8)
     done = mark_hits(
-        *columns(points), classes, np.full(n, moved), T, bin_, REACH_M, VOXEL_M, 0,
-        field.keys, field.rows, field.order, field.count, field.voxels,
+        *columns(points), classes, np.full(n, moved), T, REACH_M, VOXEL_M, 0,
+        field.keys, field.rows, field.order, field.count, field.now,
     )  # fmt: skip
     assert done == n
 
 
-def walked(field: Field, points: F8, clear_m: np.ndarray, bin_: int, T: F8 = ORIGIN) -> int:
+def walked(field: Field, points: F8, clear_m: np.ndarray, since_m: float = 0.0, start: int = 0) -> int:
     return walk(
-        *columns(points), clear_m.astype(np.float32), T, bin_, REACH_M, VOXEL_M, 0,
-        field.keys, field.rows, field.order, field.count, field.voxels,
+        *columns(points), np.full(len(points), since_m, np.float32), clear_m.astype(np.float32), ORIGIN, REACH_M, VOXEL_M,
+        start, field.keys, field.rows, field.order, field.count, field.now,
     )  # fmt: skip
 
 
 def count(field: Field, layer: int, voxel: np.ndarray) -> int:
     i, j, k = (int(v) for v in voxel)
     row = row_of(field.keys, field.rows, brick_key(i, j, k))
-    return int(field.voxels[row, layer, inner(i, j, k)]) if row >= 0 else 0
+    return int(field.counts[row, layer, inner(i, j, k)]) if row >= 0 else 0
 
 
 def voxel_of(point: F8, T: F8 = ORIGIN) -> np.ndarray:
     return np.floor((T[:3, :3] @ point + T[:3, 3]) / VOXEL_M).astype(int)
 
 
+@pytest.mark.parametrize("since_m", [0.0, 7.0])
 @pytest.mark.parametrize(
     "direction", [[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0], [3.0, -2.0, 0.5], [-1.0, 1.0, -1.0]]
 )
-def test_a_ray_passes_the_voxels_along_it_and_no_others(direction: list[float]) -> None:
+def test_a_ray_passes_the_voxels_along_it_and_no_others(direction: list[float], since_m: float) -> None:
     way = np.array(direction) / np.linalg.norm(direction)
     point, field = 20.0 * way, Field()
-    assert walked(field, point[None], np.array([15.0]), 1) == 1
-    samples = np.arange(NEAREST_M + 1e-4, 15.0, 0.003)
+    assert walked(field, point[None], np.array([15.0]), since_m) == 1
+    field.settle()
+    samples = np.arange(max(NEAREST_M, since_m) + 1e-4, 15.0, 0.003)
     sampled = {tuple(voxel_of(s * way)) for s in samples}
     assert all(count(field, BEFORE, np.array(v)) == 1 for v in sampled)
-    total = int(field.voxels[: len(field.bricks), BEFORE].sum())
+    total = int(field.counts[: len(field.bricks), BEFORE].sum())
     assert len(sampled) <= total <= 1.05 * len(sampled) + 2
 
 
 def test_returns_block_their_surroundings_for_their_bin_only() -> None:
     field, wall = Field(), np.array([[10.0, 0.0, 0.0]])
-    marked(field, wall, 1)
+    beyond, clear = np.array([[20.0, 0.0, 0.0]]), np.array([19.0])
+    marked(field, wall)
+    walked(field, beyond, clear)
+    field.settle()
     at = voxel_of(wall[0])
-    assert count(field, HITS, at) == 1
     around = [at + np.array([a, b, c]) for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 0, 1)]
-    assert all(count(field, BLOCKED, v) == 1 for v in around)
-    beyond = np.array([[20.0, 0.0, 0.0]])
-    walked(field, beyond, np.array([19.0]), 1)
-    assert count(field, PASSED, at) == 0
-    walked(field, beyond, np.array([19.0]), 2)
+    assert count(field, HITS, at) == 1
+    assert not any(count(field, layer, v) for v in around for layer in (BEFORE, AFTER))
+    walked(field, beyond, clear)
+    field.settle()
     assert count(field, AFTER, at) == 1
-    marked(field, wall, 3, moved=True)
+    assert any(count(field, BEFORE, v) for v in around)
+    marked(field, wall, moved=True)
+    field.settle()
     assert (count(field, BETWEEN, at), count(field, AFTER, at), count(field, HITS, at)) == (1, 0, 2)
     assert count(field, TRACKED, at) == 1
 
 
-def test_several_rays_of_a_bin_count_once() -> None:
+def test_what_the_ground_returns_is_no_hit_but_blocks() -> None:
+    field, point = Field(), np.array([[10.0, 0.0, 0.0]])
+    ground = np.full(1, PointClass.GROUND, np.uint8)
+    for _ in range(2):  # the second return in the same voxel finds it blocked already
+        mark_hits(
+            *columns(point), ground, np.ones(1, bool), ORIGIN, REACH_M, VOXEL_M, 0,
+            field.keys, field.rows, field.order, field.count, field.now,
+        )  # fmt: skip
+    walked(field, 2.0 * point, np.array([19.0]))
+    field.settle()
+    at = voxel_of(point[0])
+    assert not any(count(field, layer, at) for layer in (HITS, TRACKED, BEFORE, AFTER))
+    marked(field, point)
+    field.settle()
+    assert count(field, HITS, at) == 1
+
+
+def test_several_rays_and_returns_of_a_bin_count_once() -> None:
     field, beyond = Field(), np.array([[20.0, 0.0, 0.0]] * 5)
-    walked(field, beyond, np.full(5, 15.0), 1)
+    marked(field, beyond)
+    walked(field, beyond, np.full(5, 15.0))
+    field.settle()
     assert count(field, BEFORE, voxel_of(np.array([10.0, 0, 0]))) == 1
+    assert count(field, HITS, voxel_of(beyond[0])) == 1
 
 
 def test_a_ray_that_is_nowhere_clear_says_nothing() -> None:
     field = Field()
-    assert walked(field, np.array([[20.0, 0, 0], [5.0, 0, 0]]), np.array([NEAREST_M, np.nan]), 1) == 2
+    assert walked(field, np.array([[20.0, 0, 0], [5.0, 0, 0]]), np.array([NEAREST_M, np.nan])) == 2
+    assert walked(field, np.array([[20.0, 0, 0]]), np.array([15.0]), 15.0) == 1
     assert len(field.bricks) == 0
 
 
@@ -111,10 +136,7 @@ def test_the_field_grows_when_it_is_full() -> None:
     points = 59.0 * np.column_stack((np.cos(angle), np.sin(angle), 0.4 * np.sin(9 * angle)))
     clear, done = np.full(len(points), 58.0), 0
     while True:
-        done = walk(
-            *columns(points), clear.astype(np.float32), ORIGIN, 1, REACH_M, VOXEL_M, done,
-            field.keys, field.rows, field.order, field.count, field.voxels,
-        )  # fmt: skip
+        done = walked(field, points, clear, start=done)
         if done == len(points):
             break
         assert len(field.bricks) == len(field.order)
@@ -123,20 +145,61 @@ def test_the_field_grows_when_it_is_full() -> None:
     roomy = Field()
     for _ in range(4):
         roomy.grow()
-    assert walked(roomy, points, clear, 1) == len(points)
+    assert walked(roomy, points, clear) == len(points)
+    for each in (field, roomy):
+        each.settle()
     a, b = np.argsort(field.bricks), np.argsort(roomy.bricks)
     assert (field.bricks[a] == roomy.bricks[b]).all()
-    assert (field.voxels[a, BEFORE] == roomy.voxels[b, BEFORE]).all()
+    assert (field.counts[a, BEFORE] == roomy.counts[b, BEFORE]).all()
 
 
-def test_stamps_come_round_after_their_last() -> None:
+def test_counts_of_bins_stop_at_their_limit() -> None:
     field, beyond = Field(), np.array([[20.0, 0.0, 0.0]])
-    stamps = [field.stamp(n) for n in range(1, SATURATED + 3)]
-    assert stamps[:2] == [1, 2]
-    assert stamps[SATURATED - 1 :] == [SATURATED, 1, 2]
-    walked(field, beyond, np.array([15.0]), field.stamp(1))
-    walked(field, beyond, np.array([15.0]), field.stamp(SATURATED + 1))
-    assert count(field, BEFORE, voxel_of(np.array([10.0, 0, 0]))) == 2
+    for bins in range(SATURATED + 2):
+        marked(field, beyond, moved=True)
+        walked(field, beyond, np.array([15.0]))
+        field.settle()
+        assert count(field, BEFORE, voxel_of(np.array([10.0, 0, 0]))) == min(bins + 1, SATURATED)
+    at = voxel_of(beyond[0])
+    assert (count(field, HITS, at), count(field, TRACKED, at)) == (SATURATED, SATURATED)
+
+
+def test_rays_that_lie_close_together_are_followed_where_they_part() -> None:
+    """A fan as dense as a real one sees through the same voxels as with every ray followed from the start."""
+    rng = np.random.default_rng(0)
+    yaw, pitch = np.meshgrid(np.radians(np.arange(-20.0, 20.0, 0.18)), np.radians(np.arange(-8.0, 8.0, 0.4)))
+    way = np.column_stack(
+        [a.ravel() for a in (np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch))]
+    )
+    reach = np.where(rng.random(len(way)) < 0.2, rng.uniform(3.0, 12.0, len(way)), 40.0)
+    points, image = reach[:, None] * way, new_image()
+    since = followed_since(fill(*columns(points), image), reach.astype(np.float32), VOXEL_M)
+    assert (since == 0.0).sum() < 0.02 * len(way)
+    assert since.max() == pytest.approx(WIDTH_SHARE * VOXEL_M / CELL_RAD)
+    seen = []
+    for start_m in (np.zeros_like(since), since):
+        field = Field()
+        walk(
+            *columns(points), start_m, reach.astype(np.float32), ORIGIN, REACH_M, VOXEL_M, 0,
+            field.keys, field.rows, field.order, field.count, field.now,
+        )  # fmt: skip
+        field.settle()
+        seen.append({int(key): field.counts[row, BEFORE] for row, key in enumerate(field.bricks)})
+    all_rays, leaders = seen
+    assert set(leaders) <= set(all_rays)
+    missed = sum(int(all_rays[k].sum()) - int(leaders[k].sum() if k in leaders else 0) for k in all_rays)
+    assert 0 <= missed < 0.01 * sum(int(c.sum()) for c in all_rays.values())
+
+
+def test_of_rays_in_a_cell_the_farthest_leads() -> None:
+    cell, clear = np.array([5, 5, 5, -1, 9], np.int32), np.array([4.0, 9.0, 9.0, 30.0, 2.0], np.float32)
+    since = followed_since(cell, clear, VOXEL_M)
+    finest = WIDTH_SHARE * VOXEL_M / CELL_RAD
+    assert since[[0, 2]] == pytest.approx(finest)
+    assert since[[1, 3]].tolist() == [0.0, 0.0]
+    assert since[4] == pytest.approx(
+        finest / 2**4
+    )  # columns 5 and 9 are in one cell where it is 16 columns wide
 
 
 def test_grazing_rays_end_early_and_steep_ones_late() -> None:
