@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.schemas.scans import DeskewedScan, Scan
+from scanloom.stages.denoise.frame import Frame
 from scanloom.stages.geometry.motion import MotionTrack
 from scanloom.stages.geometry.neighbours import ThinScan, twist_between
 from scanloom.stages.geometry.range_image import RangeImage
@@ -33,6 +35,11 @@ class View:
     """(n,) values of PointClass; STATIC where nothing else is known."""
     image: RangeImage
     """Of the points in range that are not the own vehicle."""
+
+    @cached_property
+    def frame(self) -> Frame:
+        """The image, for looking up neighbours."""
+        return Frame.of(self.image, self.scan.x_m, self.scan.y_m, self.scan.z_m)
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ TAU = 2 * np.pi
 
 ATAN = tuple(np.float32(c / TAU) for c in (0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.0208351))
 ZERO, QUARTER, HALF, WHOLE, TINY = (np.float32(c) for c in (0.0, 0.25, 0.5, 1.0, 1e-30))
-BINS_PER_TURN = np.float32(2 * BINS)
+BINS_PER_TURN, LAST_BIN = np.float32(2 * BINS), np.int32(BINS - 1)
 
 
 class ImageSettings(BaseModel):
@@ -189,7 +189,7 @@ def _draw(x: F4, y: F4, z: F4, drawn: B1, elevation: I2, row: I4, point: I4, ran
 def elevation_bin(level: float, z: float) -> int:
     """Bin of elevation of a point `level` m away on the level and `z` m up."""
     up = turn_of(level, z)
-    return min(int((up + QUARTER if up < HALF else up - HALF - QUARTER) * BINS_PER_TURN), BINS - 1)
+    return min(np.int32((up + QUARTER if up < HALF else up - HALF - QUARTER) * BINS_PER_TURN), LAST_BIN)  # type: ignore[return-value]
 
 
 @kernel
