@@ -13,9 +13,10 @@ from scanloom.schemas.product import Files, Table, column
 
 @dataclass(frozen=True)
 class Metrics(Table):
-    """One row per metric. Names are stable and dotted."""
+    """One row per metric. Names are stable and dotted; `metrics.METRICS` says how to read each."""
 
     NAME: ClassVar[str] = "metrics"
+    SCHEMA_VERSION: ClassVar[int] = 2
 
     name: NDArray[np.object_] = column("str", "stable dotted name, for instance `fusion.ate_rmse_m`")
     value: NDArray[np.float64] = column("f8", "the figure")
@@ -23,6 +24,10 @@ class Metrics(Table):
     scope: NDArray[np.object_] = column("str", "`scan`, `session`, `map` or `run`")
     session: NDArray[np.object_] = column("str", "session it concerns; empty for a map")
     method: NDArray[np.object_] = column("str", "how it was computed, in words")
+    samples: NDArray[np.int64] = column(
+        "i8", "from how many samples it was computed; -1 for a plain count of all"
+    )
+    truth: NDArray[np.bool_] = column("?", "truth was needed to compute it")
 
 
 @dataclass(frozen=True)

@@ -102,12 +102,18 @@ def write_text(path: Path, text: str) -> None:
 
 
 def metric_rows(metrics: Metrics) -> list[Metric]:
-    """Rows as they stand in `metrics.json`; the session is named when there is more than one."""
+    """Rows as they stand in `metrics.json`; the session is named when there is more than one.
+
+    `truth` says whether truth was needed, `samples` from how many samples the value comes, where it is no plain count.
+    """
     several = len({s for s in metrics.session if s}) > 1
     rows = []
     for i in range(len(metrics)):
         row = {key: getattr(metrics, key)[i] for key in ("name", "value", "unit", "scope", "method")}
         row["value"] = float(row["value"])
+        row["truth"] = bool(metrics.truth[i])
+        if metrics.samples[i] >= 0:
+            row["samples"] = int(metrics.samples[i])
         if several and metrics.session[i]:
             row["session"] = metrics.session[i]
         rows.append(row)

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from scanloom.schemas.evaluation import Metrics
+from scanloom.schemas.metrics import kind_of
 
 Scope = Literal["session", "map"]
 
@@ -23,6 +24,14 @@ class Figure:
     method: str
     scope: Scope = "session"
     session: str = ""
+    samples: int | None = None
+    """From how many samples it was computed; None for a plain count of everything."""
+
+
+def needs_truth(name: str) -> bool:
+    """Whether a metric is computed with the help of truth."""
+    kind = kind_of(name)
+    return kind is not None and kind.truth
 
 
 def to_metrics(figures: Iterable[Figure]) -> Metrics:
@@ -39,4 +48,6 @@ def to_metrics(figures: Iterable[Figure]) -> Metrics:
         scope=strings("scope"),
         session=strings("session"),
         method=strings("method"),
+        samples=np.array([-1 if row.samples is None else row.samples for row in rows], np.int64),
+        truth=np.array([needs_truth(row.name) for row in rows], bool),
     )

@@ -16,8 +16,13 @@ Truth is used here alone, and only where there is some:
   that the graph uses; `gnss.used_error_*`: what the fixes in use are truly off by.
 
 Without truth: `odometry.degenerate_*`, where a direction was not seen beyond noise; `gnss.*`, what became of the fixes by
-the receiver's own status and how far they lie from the antenna of the finished map; `sensors.*`; `map.*`, mean map entropy;
-`clean.*`, how many points were left out of the map and why, and the entropy at the same points with them and without.
+the receiver's own status and how far they lie from the antenna of the finished map; `sensors.*`; `clean.*`, how many
+points were left out of the map and why, and the entropy at the same points with them and without; and of the map itself:
+
+* `map.mme_*`, mean map entropy, and `map.mpv_*`, mean plane variance: how crisp it is.
+* `map.wall_*`: how thick upright surfaces are, and how many of them are doubled, as walls are when two passes do not fit.
+* `map.overlap_*`: how much of it was met again on a later pass, or by another session.
+* `map.ground_density_*`, `map.surface_density_*`: points per square metre of the map.
 """
 
 from __future__ import annotations
@@ -48,14 +53,15 @@ from scanloom.stages.evaluation.revisits import revisits
 from scanloom.stages.evaluation.search import search_figures
 from scanloom.stages.evaluation.sensors import sensor_figures
 from scanloom.stages.evaluation.sessions import session_figures
+from scanloom.stages.evaluation.survey import Manner
 from scanloom.stages.evaluation.trajectories import error_track, trajectory_figures, truth_figures
 from scanloom.stages.geometry.factor_rows import FixRows, fix_rows
 
-VERSION = 1
+VERSION = 2
 
 
 class Settings(BaseModel):
-    """What counts as a true loop, and how the entropy of the map is sampled."""
+    """What counts as a true loop, and how closely the map is looked at."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -69,10 +75,15 @@ class Settings(BaseModel):
     entropy_neighbours: int = Field(
         6, ge=4, le=1000, description="points a neighbourhood needs, the point itself included"
     )
-    entropy_samples: int = Field(
-        20_000, ge=100, le=1_000_000, description="points of the map at which entropy is taken"
+    samples_per_tile: int = Field(
+        1000,
+        ge=10,
+        le=1_000_000,
+        description="points of a tile around which the map is looked at closely, at most",
     )
-    seed: int = Field(0, ge=0, description="of the choice of these points")
+    wall_gap_m: tuple[float, float] = Field(
+        (0.05, 0.4), description="least and largest distance of the layers of a double wall, m"
+    )
 
 
 def evaluation(
@@ -111,15 +122,14 @@ def evaluation(
     figures += _loop_figures(settings, loops, graph, paths)
     figures += session_figures(paths, given.poses)
     figures.append(_georeferenced(given.poses))
-    figures += map_figures(
-        tiles,
-        settings.entropy_radii_m,
-        settings.entropy_neighbours,
-        settings.entropy_samples,
-        settings.seed,
-        removed,
-    )
+    figures += map_figures(tiles, removed, given.poses, _manner(settings))
     yield to_metrics(figures)
+
+
+def _manner(settings: Settings) -> Manner:
+    return Manner(
+        settings.samples_per_tile, settings.entropy_radii_m, settings.entropy_neighbours, settings.wall_gap_m
+    )
 
 
 @dataclass(frozen=True)

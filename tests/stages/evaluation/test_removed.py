@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from scanloom.schemas.clean import ClassCounts
 from scanloom.schemas.scans import PointClass
-from scanloom.schemas.tiles import RemovedTile, Tile
-from scanloom.stages.evaluation.removed import count_figures, crispness_figures
+from scanloom.schemas.tiles import RemovedTile
+from scanloom.stages.evaluation.removed import count_figures
+from scanloom.stages.geometry.entropy import mean_entropy, point_entropies
+from tests.stages.evaluation.tiles import MANNER, map_values
 from tests.tiles import tile_of
 
 
@@ -17,10 +21,6 @@ def counts(**points: int) -> ClassCounts:
     for name, number in points.items():
         row[0, PointClass[name.upper()]] = number
     return ClassCounts(scan_index=np.zeros(1, np.int64), points=row, before=row)
-
-
-def tile(kind: type[Tile], points: np.ndarray, class_: PointClass) -> Tile:
-    return tile_of(points, kind=kind, class_=int(class_))
 
 
 def test_shares_are_of_what_could_be_mapped() -> None:
@@ -42,13 +42,22 @@ def test_a_trail_through_a_street_blurs_it() -> None:
     rng = np.random.default_rng(0)
     road = np.column_stack((rng.uniform(0, 20, (4000, 2)), rng.normal(0, 0.01, 4000)))
     trail = np.column_stack((rng.uniform(0, 20, 1500), rng.uniform(8, 12, 1500), rng.uniform(0, 1.5, 1500)))
-    kept, gone = tile(Tile, road, PointClass.GROUND), tile(RemovedTile, trail, PointClass.DYNAMIC)
-    chosen = [np.arange(0, 4000, 10)]
-    found = {f.name: f.value for f in crispness_figures([kept], [gone], chosen, 0.5, 6)}
+    kept, gone = tile_of(road), tile_of(trail, kind=RemovedTile)
+    found = map_values(kept, removed=(gone,))
     assert found["clean.mme_without_removed_nat"] < found["clean.mme_with_removed_nat"] - 0.05
-    nothing = tile(RemovedTile, trail[:0], PointClass.DYNAMIC)
-    same = {f.name: f.value for f in crispness_figures([kept], [nothing], chosen, 0.5, 6)}
+    same = map_values(kept, removed=(tile_of(trail[:0], kind=RemovedTile),))
     assert same["clean.mme_without_removed_nat"] == same["clean.mme_with_removed_nat"]
     assert same["clean.mme_without_removed_nat"] == pytest.approx(
         found["clean.mme_without_removed_nat"], abs=0.02
     )
+    assert not [name for name in map_values(kept) if name.startswith("clean")]
+
+
+def test_entropy_with_what_was_left_out_is_that_of_all_points_together() -> None:
+    rng = np.random.default_rng(1)
+    kept, gone = rng.uniform(0, 4, (3000, 3)), rng.uniform(0, 4, (2000, 3))
+    manner = replace(MANNER, samples=3000)
+    found = map_values(tile_of(kept), removed=(tile_of(gone, kind=RemovedTile),), manner=manner)
+    together = np.concatenate((kept, gone)).astype(np.float32)
+    want, _ = mean_entropy(point_entropies(together, np.arange(3000), (0.5,), 6))
+    assert found["clean.mme_with_removed_nat"] == pytest.approx(float(want[0]), abs=2e-3)

@@ -30,10 +30,6 @@ from tests.stages.mapping import (
 from tests.tiles import tile_of
 
 
-def random_tile(points: F8, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Tile:
-    return tile_of(points, offset_m=offset)
-
-
 def run(
     true: F8, estimate: F8, *, fused: F8 | None = None, truth: Truth | None = None, loops: Loops | None = None,
     tiles: Parts[Tile] | None = None, graph: Graph | None = None, gnss: Gnss | None = None, odometry: Odometry | None = None,
@@ -152,13 +148,13 @@ def test_what_was_measured_of_the_sensors_is_a_figure_and_what_was_not_is_none()
     assert "sensors.wheel_clock_offset_s" not in figures
 
 
-def test_the_sample_is_seeded_and_spread_over_all_tiles() -> None:
+def test_the_sample_is_spread_over_all_tiles_and_always_the_same() -> None:
     rng = np.random.default_rng(0)
     parts = Parts(
         [
             (
                 (("tile", f"{i}_0"),),
-                random_tile(rng.uniform(0, 10, (30_000, 3)) * [1, 1, 0.01], (50.0 * i, 0.0, 0.0)),
+                tile_of(rng.uniform(0, 10, (30_000, 3)) * [1, 1, 0.01], offset_m=(50.0 * i, 0.0, 0.0)),
             )
             for i in range(3)
         ]
@@ -197,4 +193,4 @@ def test_a_blurred_map_has_more_entropy() -> None:
 
 
 def one_tile(points: F8) -> Parts[Tile]:
-    return Parts([((("tile", "0_0"),), random_tile(points))])
+    return Parts([((("tile", "0_0"),), tile_of(points))])

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from scanloom.schemas.evaluation import Metrics
 from scanloom.schemas.scans import PointClass
 from scanloom.schemas.tiles import LEFT_OUT, RemovedTile
 from scanloom.stages.report.figures import Figures
 from scanloom.stages.report.left_out import COLOURS, WORDS, left_out, out_rows
 from scanloom.stages.report.raster import View
-from tests.stages.evaluation.test_removed import tile
+from tests.metrics import metrics_table
+from tests.tiles import tile_of
 
 VIEW = View(0.0, 0.0, 40, 20, 0.5)
 
 
 def test_points_are_drawn_in_the_colour_of_their_class_and_nothing_elsewhere() -> None:
     places = np.array([[5.2, 5.2, 0.0], [99.0, 5.0, 0.0], [5.2, 5.2, 3.0], [15.2, 5.2, 0.0]])
-    both = tile(RemovedTile, places, PointClass.DYNAMIC)
+    both = tile_of(places, kind=RemovedTile, class_=int(PointClass.DYNAMIC))
     both.class_[(both.z_m > 1) | (both.x_m == np.float32(15.2))] = PointClass.OUTLIER
     drawn = np.asarray(left_out([both], VIEW))
     assert drawn.shape == (20, 40)
@@ -32,23 +32,14 @@ def test_without_points_the_sheet_is_empty() -> None:
     assert not np.asarray(left_out([], VIEW)).any()
 
 
-def metrics(rows: list[tuple[str, float, str]]) -> Metrics:
-    n = len(rows)
-    return Metrics(
-        name=np.array([r[0] for r in rows], object), value=np.array([r[1] for r in rows]),
-        unit=np.array([""] * n, object), scope=np.array(["session"] * n, object),
-        session=np.array([r[2] for r in rows], object), method=np.array([""] * n, object),
-    )  # fmt: skip
-
-
 def test_sessions_add_up_and_shares_are_weighted() -> None:
     given = [("clean.dynamic_points", 10.0, "a"), ("clean.dynamic_share", 0.1, "a"),
              ("clean.dynamic_points", 10.0, "b"), ("clean.dynamic_share", 0.01, "b")]  # fmt: skip
-    (row,) = out_rows(["a", "b"], Figures(metrics(given)))
+    (row,) = out_rows(["a", "b"], Figures(metrics_table(given)))
     assert row.points == 20
     assert abs(row.percent - 100 * 20 / 1100) < 1e-9
 
 
 def test_every_class_that_is_left_out_has_a_colour_and_words() -> None:
     assert set(COLOURS) == set(WORDS) == set(LEFT_OUT)
-    assert out_rows(["a"], Figures(metrics([]))) == []
+    assert out_rows(["a"], Figures(metrics_table([]))) == []

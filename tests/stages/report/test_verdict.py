@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
-from scanloom.schemas.evaluation import Metrics
 from scanloom.schemas.pose_graph import Graph
 from scanloom.stages.report.figures import Figures
 from scanloom.stages.report.verdict import Limits, judge
+from tests.metrics import metrics_table
 from tests.stages.mapping import session_of
 
 
@@ -30,9 +29,6 @@ def test_checks_follow_the_figures(
     name: str, session: str, value: float, text: str, level: str | None
 ) -> None:
     limits = Limits(0.01, 0.1, 2.0, 10.0, 1.0, 2.0, 500.0)
-    metrics = Metrics(
-        name=np.array([name], object), value=np.array([value]), unit=np.array([""], object),
-        scope=np.array(["map"], object), session=np.array([session], object), method=np.array([""], object),
-    )  # fmt: skip
+    metrics = metrics_table([(name, value, session)])
     checks = judge(limits, {"a": session_of()}, Figures(metrics), {}, Graph.empty()).checks
     assert [check.level for check in checks if text in check.text] == ([level] if level else [])
