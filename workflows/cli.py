@@ -50,6 +50,13 @@ class Mode(StrEnum):
     SOFT = "soft"
 
 
+class Heights(StrEnum):
+    """What the heights of an export are counted from."""
+
+    ELLIPSOIDAL = "ellipsoidal"
+    ORTHOMETRIC = "orthometric"
+
+
 OBJECTS_BETWEEN_COLLECTIONS = 100_000
 """Imports make many objects that stay; looking for garbage among them every 700 objects took a quarter of their time."""
 
@@ -328,6 +335,55 @@ def nightly(
     else:
         print(f"summary: {night.page}")
     raise typer.Exit(night.exit_code)
+
+
+@app.command()
+def export(
+    folder: Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a finished map.")],
+    formats: Annotated[
+        str,
+        typer.Option("--format", help="Formats, separated by commas; `scanloom export --list` names them."),
+    ] = "",
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder of the exports (default MAP/exports).")
+    ] = None,
+    epsg: Annotated[
+        int | None,
+        typer.Option("--epsg", help="EPSG code of a projected system (default the map's UTM zone)."),
+    ] = None,
+    heights: Annotated[
+        Heights, typer.Option("--heights", help="Above the ellipsoid, or above the geoid of --vertical-epsg.")
+    ] = Heights.ELLIPSOIDAL,
+    vertical_epsg: Annotated[
+        int | None,
+        typer.Option("--vertical-epsg", help="System of orthometric heights (default 5773, EGM96)."),
+    ] = None,
+    removed: Annotated[
+        bool,
+        typer.Option("--removed", help="With the points that are left out of the map, by their classes."),
+    ] = False,
+    per_tile: Annotated[
+        bool, typer.Option("--per-tile", help="LAZ: one file per tile besides the whole map.")
+    ] = False,
+    list_all: Annotated[bool, typer.Option("--list", help="Only say which formats there are.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """A map into other formats: point clouds with their coordinate system, trajectories, rasters, web tiles."""
+    from scanloom.workflows.export_map import export_map, known_formats, options_of
+
+    if list_all:
+        rows = known_formats()
+        _emit(rows) if as_json else print("\n".join(f"{row['format']:11} {row['doc']}" for row in rows))
+        return
+    options = options_of(
+        epsg=epsg, heights=heights.value, vertical_epsg=vertical_epsg, removed=removed, per_tile=per_tile
+    )
+    done = export_map(folder, formats, options, out)
+    if as_json:
+        _emit([entry.as_json() for entry in done])
+    else:
+        for entry in done:
+            print(entry.text())
 
 
 @app.command()

@@ -19,8 +19,11 @@ from scanloom.stages.exports.dem import write_dem
 from scanloom.stages.exports.geojson import write_geojson
 from scanloom.stages.exports.geoparquet import write_geoparquet
 from scanloom.stages.exports.gpx import write_gpx
+from scanloom.stages.exports.las import write_laz
 from scanloom.stages.exports.options import Options
 from scanloom.stages.exports.orthophoto import write_orthophoto
+from scanloom.stages.exports.pcd import write_pcd
+from scanloom.stages.exports.ply import write_ply
 from scanloom.stages.exports.source import MapSource
 from scanloom.stages.exports.stac import write_stac
 from scanloom.stages.exports.trajectory import write_kitti, write_tum
@@ -39,11 +42,16 @@ class Format:
     """Extra of this package that brings `needs`; None where everything is always there."""
     needs: tuple[str, ...] = ()
     """Modules that are not part of every installation."""
+    lists_others: bool = False
+    """Made from the other exports beside it, hence written after them."""
     version: int = 1
     """Raised when the same map would give other files: old exports are then made anew."""
 
 
 _ROWS: tuple[Format, ...] = (
+    Format("ply", "whole map with all columns, float32 from an offset", write_ply),
+    Format("pcd", "whole map as x y z intensity class, float32 from an offset", write_pcd),
+    Format("laz", "whole map as LAZ 1.4 with its coordinate system", write_laz, "las", ("laspy", "lazrs")),
     Format("tum", "trajectory as text of TUM, in the map's frame", write_tum),
     Format(
         "kitti", "trajectory as text of KITTI: 3 x 4 matrices of the LiDAR, in the map's frame", write_kitti
@@ -57,7 +65,14 @@ _ROWS: tuple[Format, ...] = (
     ),
     Format("dem", "heights of the ground as GeoTIFF", write_dem, "raster", ("rasterio",)),
     Format("orthophoto", "intensity from above as GeoTIFF", write_orthophoto, "raster", ("rasterio",)),
-    Format("stac", "catalogue item of the map and all its exports", write_stac, "stac", ("pystac",)),
+    Format(
+        "stac",
+        "catalogue item of the map and all its exports",
+        write_stac,
+        "stac",
+        ("pystac",),
+        lists_others=True,
+    ),
 )
 """In the order in which they are written when all are asked for; the catalogue last, since it lists the others."""
 
@@ -71,6 +86,8 @@ def chosen(names: list[str]) -> list[Format]:
     ------
     UsageError : a name that no format has, or a format whose library is not installed.
     """
+    if not names:
+        raise UsageError("no format is named", next_step=f"give --format with some of: {', '.join(FORMATS)}")
     found = [_named(name) for name in dict.fromkeys(names)]
     for entry in found:
         missing = [module for module in entry.needs if find_spec(module) is None]

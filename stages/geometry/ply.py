@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 VERTEX = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("class", "u1")]
 )  # packed: 17 bytes a point
-_TYPES = {"<f4": "float", "|u1": "uchar"}
+_TYPES = {"<f4": "float", "<f8": "double", "<i4": "int", "<u2": "ushort", "|u1": "uchar"}
 
 
-def header(points: int, comments: Sequence[str]) -> bytes:
-    """Header of a cloud of `points` vertices; comments must be single lines."""
+def header(points: int, comments: Sequence[str], vertex: np.dtype[Any] = VERTEX) -> bytes:
+    """Header of a cloud of `points` vertices of packed fields; comments must be single lines."""
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += [f"comment {comment}" for comment in comments]
     lines.append(f"element vertex {points}")
-    lines += [f"property {_TYPES[VERTEX[name].str]} {name}" for name in VERTEX.names or ()]
+    lines += [f"property {_TYPES[vertex[name].str]} {name}" for name in vertex.names or ()]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii", "replace")
 
 

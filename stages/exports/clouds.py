@@ -1,0 +1,109 @@
+"""Points of a map on their way into a file: tile after tile, in the coordinates of the export."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from scanloom.schemas.tiles import RemovedTile, Tile
+from scanloom.stages.exports.coordinates import Projector
+from scanloom.stages.exports.options import Options
+from scanloom.stages.exports.source import MapSource
+
+F8 = NDArray[np.float64]
+
+REMOVED = "-removed"
+"""Ends the name of a cloud of what was left out of a tile."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Some points of one tile, placed."""
+
+    name: str
+    """Of the tile; that of what was left out of it ends in `REMOVED`."""
+    xyz: F8
+    """(n, 3) in the export's system, m."""
+    tile: Tile
+    """All their columns."""
+    axes: F8
+    """Rotation (3, 3) of directions of the map's frame into the export's."""
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    @property
+    def normals(self) -> NDArray[np.float32]:
+        """Unit normals (n, 3) along the export's axes; zeros where there is no surface."""
+        turned = self.tile.normal.astype(np.float32) @ self.axes.T.astype(np.float32)
+        length = np.linalg.norm(turned, axis=1, keepdims=True)
+        return np.asarray(turned / np.maximum(length, 1.0), np.float32)
+
+    def take(self, rows: NDArray[np.int64]) -> Cloud:
+        return replace(self, xyz=self.xyz[rows], tile=self.tile.take(rows))
+
+
+def points_of(source: MapSource, options: Options) -> int:
+    """How many points `clouds` gives."""
+    left_out = (pq.read_metadata(path).num_rows for path in _removed_files(source, options))
+    return source.points + sum(left_out)
+
+
+def clouds(source: MapSource, projector: Projector, options: Options) -> Iterator[Cloud]:
+    """All points of an export, one tile in memory at a time."""
+    for name in part_names(source, options):
+        yield cloud_of(source, projector, name)
+
+
+def cloud_of(source: MapSource, projector: Projector, name: str) -> Cloud:
+    """One of `part_names`, placed."""
+    tile = part(source, name)
+    return Cloud(name, projector.tile(tile), tile, projector.axes(tile.offset_m))
+
+
+def part_names(source: MapSource, options: Options) -> list[str]:
+    """Tiles, and what was left out of each, in the order of `clouds`."""
+    return source.tile_names + [f"{path.stem}{REMOVED}" for path in _removed_files(source, options)]
+
+
+def part_file(source: MapSource, name: str) -> Path:
+    """Where one of `part_names` lies."""
+    if name.endswith(REMOVED):
+        return source.folder / "removed" / f"{name.removesuffix(REMOVED)}.parquet"
+    return source.folder / "tiles" / f"{name}.parquet"
+
+
+def part(source: MapSource, name: str) -> Tile:
+    """One of `part_names`; sessions are numbered as in `session_names`, not as in the tile."""
+    kind = RemovedTile if name.endswith(REMOVED) else Tile
+    tile = kind.open(part_file(source, name))
+    everyone = session_names(source)
+    numbers = np.array([everyone.index(session) for session in tile.sessions] or [0], np.uint16)
+    return replace(tile, session=numbers[tile.session], sessions=everyone)
+
+
+def session_names(source: MapSource) -> tuple[str, ...]:
+    """Sessions of the map in the order of its header, then those that only tiles still name."""
+    listed = [str(session["name"]) for session in source.header.get("sessions", [])]
+    met = sorted({name for names in source.index.sessions for name in str(names).split()})
+    return tuple(dict.fromkeys(listed + met))
+
+
+def _removed_files(source: MapSource, options: Options) -> list[Path]:
+    return sorted((source.folder / "removed").glob("*.parquet")) if options.removed else []
+
+
+def round_offset_m(source: MapSource, projector: Projector) -> F8:
+    """A round place near the middle of the map in the export's system (3,), m: what float32 coordinates start from.
+
+    Whole hundreds of metres, so that single precision keeps a millimetre up to 8 km away.
+    """
+    if len(source.index) == 0:
+        return np.zeros(3)
+    middle = (source.index.min_m.min(axis=0) + source.index.max_m.max(axis=0)) / 2.0
+    return np.round(projector.project(middle)[0] / 100.0) * 100.0

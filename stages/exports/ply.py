@@ -1,0 +1,69 @@
+"""PLY: every point and every column of the map in one cloud."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.stages.exports.clouds import Cloud, clouds, points_of, round_offset_m, session_names
+from scanloom.stages.exports.coordinates import Projector
+from scanloom.stages.exports.options import Options
+from scanloom.stages.exports.sidecar import placement_comments, write_placement
+from scanloom.stages.exports.source import MapSource
+from scanloom.stages.geometry import ply
+
+VERTEX = np.dtype(
+    [
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("nx", "<f4"),
+        ("ny", "<f4"),
+        ("nz", "<f4"),
+        ("intensity", "<f4"),
+        ("class", "u1"),
+        ("level", "u1"),
+        ("session", "<u2"),
+        ("count", "<i4"),
+        ("first_s", "<f8"),
+        ("last_s", "<f8"),
+    ]
+)
+_S_PER_NS = 1e-9
+
+
+def write_ply(source: MapSource, folder: Path, options: Options) -> list[Path]:
+    """`map.ply` and, beside it, `map.json` with offset and coordinate system.
+
+    Coordinates are float32 from a round offset: whole UTM coordinates in float32 would have steps of half a metre, and
+    few programs read doubles without rounding them to float32 themselves.
+    """
+    projector = Projector.of(source, options)
+    offset_m = round_offset_m(source, projector)
+    path = folder / "map.ply"
+    comments = [
+        f"scanloom map {source.name}",
+        *placement_comments(projector, offset_m),
+        "class 1 ground, 2 static; first_s last_s: seconds of the log's clock, mostly since 1970",
+        *(f"session {number} {name}" for number, name in enumerate(session_names(source))),
+    ]
+    with path.open("wb") as stream:
+        stream.write(ply.header(points_of(source, options), comments, VERTEX))
+        for cloud in clouds(source, projector, options):
+            stream.write(vertices(cloud, offset_m).data)
+    return [path, write_placement(folder / "map.json", projector, offset_m)]
+
+
+def vertices(cloud: Cloud, offset_m: NDArray[np.float64]) -> NDArray[np.void]:
+    """Packed rows (n,) of `VERTEX`."""
+    tile, normals = cloud.tile, cloud.normals
+    out = np.empty(len(cloud), VERTEX)
+    for axis, name in enumerate("xyz"):
+        out[name] = cloud.xyz[:, axis] - offset_m[axis]
+        out[f"n{name}"] = normals[:, axis]
+    out["intensity"], out["class"], out["count"] = tile.intensity, tile.class_, tile.count
+    out["level"], out["session"] = tile.level, tile.session
+    out["first_s"], out["last_s"] = tile.first_ns * _S_PER_NS, tile.last_ns * _S_PER_NS
+    return out
