@@ -23,6 +23,7 @@ WKB_POINT_Z = 1001
 def write_geoparquet(source: MapSource, folder: Path, options: Options) -> list[Path]:
     """`trajectory.parquet`; a row group per session, positions as WKB points with z in the projected system.
 
+    What heights are counted from stands in the footer under `heights`.
     A map without georeference keeps its own coordinates, and the file says that they are of no known system
     (`"crs": null`).
 
@@ -33,13 +34,13 @@ def write_geoparquet(source: MapSource, folder: Path, options: Options) -> list[
     import pyarrow.parquet as pq
 
     projector = Projector.of(source, options)
-    crs = None if projector.crs is None else projector.crs.to_json_dict()
+    crs = None if projector.plain_crs is None else projector.plain_crs.to_json_dict()
     sessions = {
         name: (poses, projector.project(places(poses))) for name, poses in source.trajectories().items()
     }
     positions = np.vstack([np.empty((0, 3)), *(p for _, p in sessions.values())])
     path = folder / "trajectory.parquet"
-    schema = _schema(_metadata(positions, crs))
+    schema = _schema(_metadata(positions, crs), projector.heights)
     with pq.ParquetWriter(path, schema, compression="zstd") as writer:
         for name, (poses, at) in sessions.items():
             writer.write_table(_table(name, poses, at, schema))
@@ -59,7 +60,7 @@ def _metadata(positions: F8, crs: dict[str, Any] | None) -> dict[str, Any]:
     return {"version": VERSION, "primary_column": "geometry", "columns": {"geometry": column}}
 
 
-def _schema(metadata: dict[str, Any]) -> Any:
+def _schema(metadata: dict[str, Any], heights: str) -> Any:
     import pyarrow as pa
 
     numbers = [
@@ -77,11 +78,11 @@ def _schema(metadata: dict[str, Any]) -> Any:
         pa.field("session", pa.dictionary(pa.int32(), pa.string()), False),
         pa.field("scan_index", pa.int64(), False, {"doc": "number of the scan in its session"}),
         pa.field("stamp", pa.timestamp("ns", "UTC"), False, {"doc": "reference time of the scan"}),
-        pa.field("geometry", pa.binary(), False, {"doc": "position of the LiDAR"}),
+        pa.field("geometry", pa.binary(), False, {"doc": f"position of the LiDAR; z is {heights}"}),
         *(pa.field(name, pa.float64(), False, {"doc": doc} if doc else None) for name, doc in numbers),
         pa.field("keyframe", pa.bool_(), False, {"doc": "a node of the pose graph; others are interpolated"}),
     ]
-    return pa.schema(fields, {"geo": json.dumps(metadata)})
+    return pa.schema(fields, {"geo": json.dumps(metadata), "heights": heights})
 
 
 def _table(session: str, poses: Poses, positions: F8, schema: Any) -> Any:

@@ -71,11 +71,8 @@ class Ground:
                 next_step="leave this format out of --format",
             )
         row, column, rows, columns = canvas.extent
-        crs = self.projector.crs
-        if crs is not None:
-            # GeoTIFF has no projected system with a third axis; the tag HEIGHTS says the rest.
-            crs = (crs if crs.is_compound else crs.to_2d()).to_wkt()
-        return Lattice(canvas.cell, column, row + rows, rows, columns, crs)
+        crs = self.projector.plain_crs
+        return Lattice(canvas.cell, column, row + rows, rows, columns, None if crs is None else crs.to_wkt())
 
 
 def cells_in(canvas: Canvas, lattice: Lattice, window: Window, margin: int = 0) -> NDArray[np.void]:

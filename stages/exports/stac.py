@@ -158,16 +158,17 @@ def _times(source: MapSource) -> tuple[int, int]:
 
 
 def _properties(source: MapSource, projector: Projector) -> dict[str, Any]:
-    corners = projector.project(_corners(source))
+    corners, crs = projector.project(_corners(source)), projector.plain_crs
     return {
         "title": source.name,
-        "proj:code": f"EPSG:{projector.epsg}",
-        "proj:projjson": projector.crs.to_json_dict(),
+        "proj:code": f"EPSG:{crs.to_epsg()}" if crs.to_epsg() else None,
+        "proj:projjson": crs.to_json_dict(),
         "proj:bbox": [*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist()],
         "pc:count": source.points,
         "pc:type": "lidar",
         "pc:encoding": "Parquet",
         "pc:schemas": point_schema(),
+        "scanloom:heights": projector.heights,
         "scanloom:sessions": sorted(source.trajectories()),
         "scanloom:voxel_size_m": float(source.index.voxel_size_m),
     }
