@@ -17,6 +17,7 @@ from scanloom.stages.denoise.frame import places_from, taken
 from scanloom.stages.denoise.window import Moment, View
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8, inverse
+from scanloom.stages.geometry.voxels import Float
 
 F4 = NDArray[np.float32]
 B1 = NDArray[np.bool_]
@@ -226,13 +227,14 @@ def _some(place: I4, classes: U1) -> I8:
 @kernel
 def _sift(place: I4, away: F4, ranges: F4, classes: U1, intensity: F4, edges: F8) -> tuple[I8, U1]:
     """The points (m,) that are neither as bright as no particle is, nor flat ground; their bins of strength, range, ground."""
-    out, kept = np.empty(len(place), np.int64), 0
+    out, dim, kept = np.empty(len(place) + 1, np.int64), 0, 0
     told = len(edges) > 0
     bright = edges[:, BRIGHTER - 1].copy() if told else np.full(len(RANGE_EDGES_M) + 1, np.inf)
-    for n in range(len(place)):
+    for n in range(len(place)):  # written without a branch, which could not be foretold
+        out[dim] = n
+        dim += int((place[n] >= 0) & (not intensity[n] >= bright[WHOLE(_band(away[n]))]))
+    for n in out[:dim]:
         r, k = away[n], place[n]
-        if k < 0 or intensity[n] >= bright[_band(r)]:
-            continue
         if classes[n] == GROUND and _bend(ranges[k + 1], ranges[k - 1], r) < NOISE_M + NOISE_PER_M * r:
             continue
         out[kept] = n
@@ -248,7 +250,7 @@ def _sift(place: I4, away: F4, ranges: F4, classes: U1, intensity: F4, edges: F8
 
 @kernel
 def _band(r: float) -> int:
-    return (r >= BANDS_M[0]) + (r >= BANDS_M[1]) + (r >= BANDS_M[2]) + (r >= BANDS_M[3])
+    return int(r >= BANDS_M[0]) + int(r >= BANDS_M[1]) + int(r >= BANDS_M[2]) + int(r >= BANDS_M[3])
 
 
 @kernel
@@ -258,7 +260,8 @@ def _shapes(place: I4, away: F4, ranges: F4, stride: int, asked: I8) -> U1:
     for m in range(len(asked)):
         k, r = WHOLE(place[asked[m]]), away[asked[m]]
         noise, tolerance = NOISE_M + NOISE_PER_M * r, max(NEAR_M, NEAR_PER_M * r)
-        bend, straight, count = UNBENT, 0, -1
+        bend: Float = UNBENT
+        straight, count = 0, -1
         first = k - step - WHOLE(2)
         for i in range(WHOLE(3)):
             for j in range(WHOLE(5)):
