@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from benchmarks.clean_boxes import LABELS, read_boxes
 from benchmarks.clean_truth import Kinds, Known, kinds_measured, kinds_simulated, measured, simulated
 from scanloom.pipeline.run import Result
-from scanloom.schemas.product import Product
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
 from scanloom.schemas.session import TruthLog
 from scanloom.schemas.trajectory import Poses, Truth
@@ -25,7 +24,7 @@ LEFT_OUT = (PointClass.EGO, PointClass.OUT_OF_RANGE)
 TRUE, ESTIMATED = "truth", "estimated"
 
 
-def gather(log: Path | None, result: Result, products: Sequence[type[Product]], folder: Path) -> None:
+def gather(log: Path | None, result: Result, folder: Path) -> None:
     """Write the arrays of a scene, a simulated one or that of the `log`; the description comes last.
 
     A folder with a description is whole, so that one cut off is made again.
@@ -41,7 +40,6 @@ def gather(log: Path | None, result: Result, products: Sequence[type[Product]], 
         np.save(folder / f"T_{name}.npy", each)
     described = {
         "kinds": kinds,
-        "files": {p.NAME: [str(path) for _, path in result.files(p)] for p in (*products, TruthLog)},
         "inputs": _inputs(folder, T),
     }
     (folder / "scene.json").write_text(json.dumps(described, indent=1) + "\n")

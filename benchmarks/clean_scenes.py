@@ -150,8 +150,8 @@ def scene(place: Place, store: Path, kept: Path) -> Scene:
     if not (folder / "scene.json").exists():
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        gather(place.drive.folder, result, made(), folder)
-    return _opened(place, folder)
+        gather(place.drive.folder, result, folder)
+    return _opened(place, folder, result)
 
 
 def _digest(result: Result) -> str:
@@ -162,7 +162,8 @@ def _digest(result: Result) -> str:
     return hashlib.sha256("".join(digests).encode()).hexdigest()[:16]
 
 
-def _opened(place: Place, folder: Path) -> Scene:
+def _opened(place: Place, folder: Path, result: Result) -> Scene:
+    """The arrays, which the same products make again, with the places in the store where these lie now."""
     described = json.loads((folder / "scene.json").read_text())
 
     def array(name: str) -> NDArray[Any]:
@@ -180,6 +181,6 @@ def _opened(place: Place, folder: Path) -> Scene:
         stamp_ns=array("stamp_ns"),
         poses={name: array(f"T_{name}") for name in place.poses},
         kinds=described["kinds"],
-        files=described["files"],
+        files={p.NAME: [str(path) for _, path in result.files(p)] for p in (*made(), TruthLog)},
         inputs=described["inputs"],
     )

@@ -31,12 +31,12 @@ def followed_since(cell: I4, clear_m: F4, voxel_m: float) -> F4:
     since = np.zeros(len(cell), np.float32)
     leader = np.full((ROWS, COLUMNS), -1, np.int32)
     flat = leader.reshape(-1)
-    reach = np.float32(WIDTH_SHARE * voxel_m / CELL_RAD)
+    reach = WIDTH_SHARE * voxel_m / CELL_RAD
     for n in range(len(cell)):
         if cell[n] >= 0:
             flat[cell[n]] = _farther(flat[cell[n]], n, clear_m, since, reach)
     for _ in range(1, LEVELS):
-        reach *= np.float32(0.5)
+        reach *= 0.5
         leader = _merged(leader, clear_m, since, reach)
     return since
 
