@@ -8,7 +8,7 @@ BENCH ?= odometry
 PY := .venv/bin/python
 PACKAGES := schemas stages pipeline workflows
 
-.PHONY: help setup setup-dev map test check format lock nightly docs clean bench bench-setup
+.PHONY: help setup setup-dev map test check format lock nightly docs clean bench bench-setup viewer
 
 help:
 	@echo "make map [SESSION=log] [OUT=folder] [ARGS='--set odometry.voxel_size_m=0.4']   logs into a map"
@@ -47,10 +47,18 @@ lock:
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
 		--extra setup pyproject.toml -o requirements.lock
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
-		--extra setup --extra dev -c requirements.lock pyproject.toml -o requirements-dev.lock
+		--extra setup --extra export --extra dev -c requirements.lock pyproject.toml -o requirements-dev.lock
 
 clean:
 	rm -rf build store maps .venv
+
+# Bundles the libraries of the viewer's page into one file, which is kept in the repository: only whoever updates them needs
+# Node.js (https://nodejs.org).
+viewer:
+	cd workflows/viewer/vendor && npm ci --omit=peer --legacy-peer-deps --ignore-scripts && npm run build
+	cp workflows/viewer/vendor/node_modules/three/LICENSE workflows/viewer/vendor/licences/three.txt
+	cp workflows/viewer/vendor/node_modules/3d-tiles-renderer/LICENSE workflows/viewer/vendor/licences/3d-tiles-renderer.txt
+	rm -rf workflows/viewer/vendor/node_modules
 
 docs: setup
 	$(PY) -m scanloom.workflows.reference docs

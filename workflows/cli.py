@@ -387,6 +387,20 @@ def export(
 
 
 @app.command()
+def view(
+    folder: Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a finished map.")],
+    port: Annotated[
+        int, typer.Option("--port", min=0, max=65535, help="Of 127.0.0.1; 0 takes any that is free.")
+    ] = 8642,
+    browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
+) -> None:
+    """A map in the browser: served on this machine alone, streamed by level of detail; ends with Ctrl-C."""
+    from scanloom.workflows.view_map import view_map
+
+    view_map(folder, port, browser, _say)
+
+
+@app.command()
 def explain(
     artifact: Annotated[str, typer.Argument(help="Key of an artifact (a prefix will do), or its folder.")],
     store: StoreOption = None,

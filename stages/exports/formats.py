@@ -26,6 +26,7 @@ from scanloom.stages.exports.pcd import write_pcd
 from scanloom.stages.exports.ply import write_ply
 from scanloom.stages.exports.source import MapSource
 from scanloom.stages.exports.stac import write_stac
+from scanloom.stages.exports.tiles3d import write_3d_tiles
 from scanloom.stages.exports.trajectory import write_kitti, write_tum
 
 Write = Callable[[MapSource, Path, Options], list[Path]]
@@ -52,6 +53,7 @@ _ROWS: tuple[Format, ...] = (
     Format("ply", "whole map with all columns, float32 from an offset", write_ply),
     Format("pcd", "whole map as x y z intensity class, float32 from an offset", write_pcd),
     Format("laz", "whole map as LAZ 1.4 with its coordinate system", write_laz, "las", ("laspy", "lazrs")),
+    Format("3dtiles", "whole map as 3D Tiles 1.1 with glTF contents, on the globe", write_3d_tiles),
     Format("tum", "trajectory as text of TUM, in the map's frame", write_tum),
     Format(
         "kitti", "trajectory as text of KITTI: 3 x 4 matrices of the LiDAR, in the map's frame", write_kitti

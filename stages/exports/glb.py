@@ -17,13 +17,12 @@ VERTEX = np.dtype(
         ("position", "<f4", 3),
         ("colour", "u1", 4),
         ("intensity", "<f4"),
-        ("class", "u1"),
-        ("normal", "i1", 3),
-        ("session", "<u2"),
-        ("padding", "<u2"),
+        ("class", "u1", 4),
+        ("normal", "i1", 4),
+        ("session", "<u2", 2),
     ]
 )
-"""28 bytes; every attribute starts at a multiple of its component's size, every vertex of four."""
+"""32 bytes; every attribute starts at a multiple of four, so class, normal and session have padding behind them."""
 _FLOAT, _BYTE, _UNSIGNED_BYTE, _UNSIGNED_SHORT = 5126, 5120, 5121, 5123
 _ARRAY_BUFFER, _POINTS = 34962, 0
 _CLASS = {

@@ -83,6 +83,22 @@ def world_to_geodetic(origin: Georeference, points: ArrayLike) -> F8:
     return np.column_stack((lat, lon, h))
 
 
+def ecef_pose(origin: Georeference) -> F8:
+    """T_ecef_world (4, 4): the frame `world` in geocentric coordinates of WGS84 (EPSG:4978), m.
+
+    Exact. The columns are the directions east, north and up at the origin.
+    """
+    from pyproj import Transformer
+
+    lat, lon = np.radians(origin.latitude_deg), np.radians(origin.longitude_deg)
+    geocentric = Transformer.from_pipeline("+proj=pipeline +step +proj=cart +ellps=WGS84")
+    east = (-np.sin(lon), np.cos(lon), 0.0)
+    north = (-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat))
+    up = (np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat))
+    place = geocentric.transform(lon, lat, origin.height_m, radians=True)
+    return pose(np.column_stack((east, north, up)), np.array(place))
+
+
 def between_worlds(target: Georeference, source: Georeference) -> F8:
     """T_target_source (4, 4) between two frames `world`; exact, since both are Cartesian."""
     if target == source:

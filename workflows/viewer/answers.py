@@ -1,0 +1,166 @@
+"""What the page asks for, answered from the folder of a map: tilesets, contents, what a point is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scanloom.schemas.scans import PointClass
+from scanloom.stages.exports.node_points import NodeReader, Points
+from scanloom.stages.exports.nodes import Node
+from scanloom.stages.exports.source import MapSource
+from scanloom.stages.exports.tiles3d import map_tileset, tile_tileset
+from scanloom.stages.geometry.geodesy import world_to_geodetic, world_to_projected
+from scanloom.workflows.viewer.layers import Layers
+from scanloom.workflows.viewer.removed import Removed
+
+Json = dict[str, Any]
+SPREAD_PERCENT = (1.0, 99.0)
+"""Colours span heights and intensities between these percentiles."""
+
+
+class Missing(Exception):
+    """There is nothing of that name."""
+
+
+class Answers:
+    """Read-only view of one map. May be asked by several threads."""
+
+    def __init__(self, folder: Path) -> None:
+        self.source = MapSource.open(folder)
+        self.reader = NodeReader(self.source)
+        self.layers = Layers(self.source)
+        self.removed = Removed(self.source)
+        self._blocks = {node.name: node for node in self.reader.root.walk()}
+
+    def answer(self, path: str) -> tuple[str, bytes]:
+        """Content type and body of what stands at a path below `/data/`.
+
+        Raises
+        ------
+        Missing : nothing stands there.
+        """
+        head, _, rest = path.partition("/")
+        kinds: dict[str, Callable[[str], tuple[str, bytes]]] = {
+            "map.json": self._summary,
+            "layers.json": self._layers,
+            "tileset": self._tileset,
+            "removed": self.removed.answer,
+            "point": self._point,
+        }
+        if head not in kinds:
+            raise Missing(path)
+        try:
+            return kinds[head](rest)
+        except (KeyError, ValueError, IndexError) as error:
+            raise Missing(path) from error
+
+    # --- tilesets ---
+
+    def node(self, name: str) -> Node:
+        """A node by its name.
+
+        Raises
+        ------
+        KeyError : there is none.
+        """
+        tile, slash, _ = name.partition("/")
+        if not slash:
+            return self._blocks[name]
+        for top in self.reader.within(tile):
+            for node in top.walk():
+                if node.name == name:
+                    return node
+        raise KeyError(name)
+
+    def _tileset(self, path: str) -> tuple[str, bytes]:
+        if path == "tileset.json":
+            return _json(map_tileset(self.reader, None))
+        if path.startswith("tiles/") and path.endswith(".json"):
+            door = self.node(path.removeprefix("tiles/").removesuffix(".json"))
+            return _json(tile_tileset(door, self.reader.within(door.name)))
+        if not path.endswith(".glb"):
+            raise KeyError(path)
+        node = self.node(path.removesuffix(".glb").removeprefix("blocks/").removeprefix("tiles/"))
+        if not node.points:
+            raise KeyError(path)
+        return "model/gltf-binary", self.reader.content(node)
+
+    # --- words and numbers ---
+
+    def _summary(self, _: str) -> tuple[str, bytes]:
+        source, root = self.source, self.reader.root
+        sample = self.reader.points(root)
+        georeference = source.georeference
+        return _json(
+            {
+                "name": source.name,
+                "version": source.header.get("version", 1),
+                "points": source.points,
+                "tiles": len(source.tile_names),
+                "crs": crs_name(georeference.epsg) if georeference else None,
+                "epsg": georeference.epsg if georeference else None,
+                "min_m": root.min_m,
+                "max_m": root.max_m,
+                "voxel_size_m": source.index.voxel_size_m,
+                "sessions": self.reader.sessions,
+                "height_m": _spread(sample.xyz_m[:, 2]),
+                "intensity": _spread(sample.columns["intensity"]),
+                "classes": {int(c): PointClass(c).name.lower() for c in np.unique(sample.columns["class_"])},
+                "removed": self.removed.summary(),
+            }
+        )
+
+    def _layers(self, _: str) -> tuple[str, bytes]:
+        return _json(self.layers.everything())
+
+    def _point(self, path: str) -> tuple[str, bytes]:
+        """`NODE/ROW`: everything that is known of one point."""
+        name, _, row = path.rpartition("/")
+        node = self.node(name.removeprefix("blocks/").removeprefix("tiles/"))
+        if not 0 <= int(row) < node.points:
+            raise IndexError(row)
+        return _json(self._about(self.reader.points(node), int(row)))
+
+    def _about(self, points: Points, row: int) -> Json:
+        xyz = points.xyz_m[row]
+        value = {name: column[row] for name, column in points.columns.items()}
+        about: Json = {
+            "map_m": xyz.tolist(),
+            "class": PointClass(int(value["class_"])).name.lower(),
+            "intensity": float(value["intensity"]),
+            "count": int(value["count"]),
+            "session": self.reader.sessions[int(value["session"])] if self.reader.sessions else "",
+            "first_ns": str(value["first_ns"]),
+            "last_ns": str(value["last_ns"]),
+            "normal": (value["normal"] / 127.0).tolist() if value["normal"].any() else None,
+        }
+        georeference = self.source.georeference
+        if georeference is not None:
+            easting, northing, height = world_to_projected(georeference, xyz)[0].tolist()
+            latitude, longitude, _ = world_to_geodetic(georeference, xyz)[0].tolist()
+            about |= {
+                "epsg": georeference.epsg, "easting_m": easting, "northing_m": northing, "height_m": height,
+                "latitude_deg": latitude, "longitude_deg": longitude,
+            }  # fmt: skip
+        return about
+
+
+def crs_name(epsg: int) -> str:
+    """Name of a reference system, for instance `WGS 84 / UTM zone 32N`."""
+    from pyproj import CRS
+
+    return str(CRS.from_epsg(epsg).name)
+
+
+def _spread(values: Any) -> list[float]:
+    low, high = np.nanpercentile(values, SPREAD_PERCENT).tolist()
+    return [low, high if high > low else low + 1.0]
+
+
+def _json(body: Any) -> tuple[str, bytes]:
+    return "application/json", json.dumps(body, separators=(",", ":")).encode()
