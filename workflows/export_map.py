@@ -116,6 +116,7 @@ def _export(source: MapSource, entry: Format, options: Options, place: Path) -> 
         made_from["others"] = _digest_of(
             {name: row["files"] for name, row in read_record(place).items() if name != entry.name}
         )
+        made_from["beside"] = _unrecorded(source)
     folder = place / entry.name
     known = read_record(place).get(entry.name, {})
     if known.get("made_from") == made_from and _as_recorded(folder, known):
@@ -187,6 +188,13 @@ def _facts(source: MapSource, entry: Format, options: Options) -> Row:
         "box_m": projector.box(source).tolist(),
         "what": entry.doc,
     }
+
+
+def _unrecorded(source: MapSource) -> dict[str, str]:
+    """Checksums of what lies in the map's folder and changes without the map, as the report does."""
+    recorded = {HEADER, *source.header.get("files", {})}
+    paths = sorted(p for p in source.folder.iterdir() if p.is_file() and not p.name.startswith("."))
+    return {p.name: _digest(p)["sha256"] for p in paths if p.name not in recorded}
 
 
 def _as_recorded(folder: Path, row: Row) -> bool:

@@ -19,7 +19,7 @@ from scanloom.schemas.tiles import Tile
 from scanloom.stages.exports.antimeridian import area_geometry, bounding_box
 from scanloom.stages.exports.coordinates import Projector
 from scanloom.stages.exports.options import Options
-from scanloom.stages.exports.source import MapSource
+from scanloom.stages.exports.source import HEADER, MapSource
 from scanloom.stages.exports.wgs84 import moment, origin_of
 from scanloom.stages.geometry.geodesy import world_to_geodetic
 from scanloom.stages.geometry.se3 import F8
@@ -49,6 +49,17 @@ MEDIA_TYPES = {
     ".txt": "text/plain",
     ".tum": "text/plain",
 }
+RECORD = "exports.json"
+"""What the exports of a map are on record in, beside their folders."""
+WITH_A_SYSTEM_OF_ITS_OWN = {
+    "tum": None,
+    "kitti": None,
+    "gpx": "EPSG:4326",
+    "geojson": "EPSG:4326",
+    "3dtiles": "EPSG:4978",
+}
+LOOKED_AT = {".html", ".png", ".json"}
+"""Files that have no coordinates."""
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 UNKNOWN = "application/octet-stream"
 DELIVERED = {
@@ -64,7 +75,7 @@ DELIVERED = {
 def write_stac(source: MapSource, folder: Path, options: Options) -> list[Path]:
     """`item.json`: the map's footprint, its times, its point cloud, and an asset for every file of the other exports.
 
-    The exports are those that lie beside `folder` when this one is written.
+    The exports are those that are on record beside `folder` when this one is written, made from this very map.
 
     Raises
     ------
@@ -89,7 +100,7 @@ def write_stac(source: MapSource, folder: Path, options: Options) -> list[Path]:
         properties=_properties(source, projector),
         stac_extensions=list(EXTENSIONS.values()),
     )
-    for key, asset in _assets(source.folder, folder):
+    for key, asset in _assets(source, folder, _code(projector.epsg, projector.vertical_epsg)):
         item.add_asset(key, asset)
     path = folder / ITEM
     content = item.to_dict(include_self_link=False)
@@ -158,11 +169,12 @@ def _times(source: MapSource) -> tuple[int, int]:
 
 
 def _properties(source: MapSource, projector: Projector) -> dict[str, Any]:
-    corners, crs = projector.project(_corners(source)), projector.plain_crs
+    corners = projector.project(_corners(source))
+    code = _code(projector.epsg, projector.vertical_epsg)
     return {
         "title": source.name,
-        "proj:code": f"EPSG:{crs.to_epsg()}" if crs.to_epsg() else None,
-        "proj:projjson": crs.to_json_dict(),
+        "proj:code": code,
+        **({} if code else {"proj:projjson": projector.plain_crs.to_json_dict()}),
         "proj:bbox": [*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist()],
         "pc:count": source.points,
         "pc:type": "lidar",
@@ -185,39 +197,55 @@ def point_schema() -> list[dict[str, Any]]:
     return rows
 
 
-def _assets(map_folder: Path, item_folder: Path) -> Iterator[tuple[str, Any]]:
+def _assets(source: MapSource, item_folder: Path, code: str | None) -> Iterator[tuple[str, Any]]:
     """Key and asset of each delivered and each exported file, in order."""
-    for delivered, (title, roles) in DELIVERED.items():
-        if (map_folder / delivered).is_file():
-            yield delivered, _asset(map_folder / delivered, item_folder, title, roles)
-    for path in exported_files(item_folder.parent):
-        name = path.relative_to(item_folder.parent)
-        role = "metadata" if path.suffix in {".txt", ".yaml"} else "data"
-        yield (
-            f"exports/{name.as_posix()}",
-            _asset(path, item_folder, f"{name.parts[0]}: {name.name}", [role]),
-        )
+    delivered = [name for name in source.header.get("files", {}) if name.startswith("trajectory/")]
+    about = DELIVERED | dict.fromkeys(sorted(delivered), DELIVERED["trajectory.parquet"])
+    for name, (title, roles) in about.items():
+        path = source.folder / name
+        if path.is_file() and path.suffix != ".tum":
+            place = {} if path.suffix in LOOKED_AT else {"proj:code": None}
+            known = source.header.get("files", {}).get(name, {})
+            yield name, _asset(path, item_folder, title, roles, known, place)
+    for export, row in exports_of(source, item_folder.parent).items():
+        for name, known in row["files"].items():
+            path = item_folder.parent / export / name
+            role = "metadata" if path.suffix in {".txt", ".yaml"} else "data"
+            at = WITH_A_SYSTEM_OF_ITS_OWN.get(export, _code(row["crs"]["epsg"], row["crs"]["vertical_epsg"]))
+            place = {} if at == code else {"proj:code": at}
+            title = f"{export}: {row.get('what', name)}"
+            yield f"exports/{export}/{name}", _asset(path, item_folder, title, [role], known, place)
 
 
-def exported_files(exports: Path) -> list[Path]:
-    """Files of all finished exports in a folder but the catalogue's own."""
-    from scanloom.stages.exports.formats import FORMATS  # which knows this module
+def exports_of(source: MapSource, exports: Path) -> dict[str, Any]:
+    """Rows of the record of exports that were made from this very map, by format, without the catalogue's own."""
+    try:
+        rows = json.loads((exports / RECORD).read_text())["formats"]
+    except (OSError, ValueError, KeyError):
+        return {}
+    header = hashlib.sha256((source.folder / HEADER).read_bytes()).hexdigest()
+    made = {name: row for name, row in sorted(rows.items()) if row["made_from"]["map"] == header}
+    return {name: row for name, row in made.items() if name != "stac"}
 
-    found: list[Path] = []
-    for export in sorted(
-        p for p in exports.iterdir() if p.is_dir() and p.name in FORMATS and p.name != "stac"
-    ):
-        found += sorted(p for p in export.rglob("*") if p.is_file())
-    return found
+
+def _code(epsg: int | None, vertical_epsg: int | None) -> str | None:
+    """As `EPSG:32632`; None where no single code says it all."""
+    return None if epsg is None or vertical_epsg is not None else f"EPSG:{epsg}"
 
 
-def _asset(path: Path, item_folder: Path, title: str, roles: list[str]) -> Any:
+def _asset(
+    path: Path, item_folder: Path, title: str, roles: list[str], known: dict[str, Any], place: dict[str, Any]
+) -> Any:
+    """known : the file's checksum and size as they are on record; without them it is read."""
     import pystac
 
-    with path.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    size = path.stat().st_size
+    digest = known.get("sha256")
+    if known.get("bytes") != size or not digest:
+        with path.open("rb") as stream:
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
     href = quote(Path(os.path.relpath(path.resolve(), item_folder.resolve())).as_posix())
-    extra = {"file:size": path.stat().st_size, "file:checksum": SHA256_MULTIHASH + digest}
+    extra = {"file:size": size, "file:checksum": f"{SHA256_MULTIHASH}{digest}", **place}
     return pystac.Asset(href, title=title, media_type=media_type(path), roles=roles, extra_fields=extra)
 
 
