@@ -17,6 +17,7 @@ from scanloom.pipeline.run import Result
 from scanloom.schemas.changes import ChangeFiles, Changes
 from scanloom.schemas.errors import StoreError, UsageError
 from scanloom.schemas.evaluation import Metrics, PictureFiles
+from scanloom.schemas.loops import Loops
 from scanloom.schemas.objects import ObjectTracks
 from scanloom.schemas.product import Files
 from scanloom.schemas.session import Session
@@ -143,6 +144,8 @@ def _items(result: Result) -> Iterable[Item]:
     for product, names in WHOLE.items():
         for _, folder in result.files(product):
             yield from (Item(name, folder / name) for name in names if (folder / name).exists())
+    for _, path in result.files(Loops):
+        yield Item("loops.parquet", path)
     for _, path in result.files(Changes):
         if Changes.open(path).sessions:
             yield Item("changes.parquet", path)
