@@ -100,7 +100,7 @@ class Levels:
 
     @property
     def top(self) -> int:
-        return self.points.shape[1] - 1
+        return int(self.points.shape[1]) - 1
 
     @property
     def of_tile(self) -> int:
