@@ -17,7 +17,8 @@ DATE_LINE_DEG = 180.0
 
 def wrapped(longitude_deg: ArrayLike) -> F8:
     """The same longitudes in [-180, 180)."""
-    return (np.asarray(longitude_deg, float) + 180.0) % 360.0 - 180.0
+    longitude = np.asarray(longitude_deg, float)
+    return np.asarray(longitude - 360.0 * np.floor((longitude + DATE_LINE_DEG) / 360.0), float)
 
 
 def unrolled(longitude_deg: ArrayLike) -> F8:
@@ -25,7 +26,7 @@ def unrolled(longitude_deg: ArrayLike) -> F8:
     longitude = np.asarray(longitude_deg, float)
     if not len(longitude):
         return longitude
-    return wrapped(longitude[0]) + wrapped(longitude - longitude[0])
+    return np.asarray(longitude - 360.0 * np.round((longitude - wrapped(longitude[0])) / 360.0), float)
 
 
 def cut_line(positions: ArrayLike) -> list[F8]:

@@ -11,6 +11,7 @@ import pytest
 from scanloom.schemas.errors import InvalidInput
 from scanloom.schemas.frames import Georeference
 from scanloom.schemas.trajectory import Poses
+from scanloom.stages.exports.antimeridian import cut_line, unrolled, wrapped
 from scanloom.stages.exports.geojson import write_geojson
 from scanloom.stages.exports.gpx import write_gpx
 from scanloom.stages.exports.options import Options
@@ -109,3 +110,27 @@ def test_a_map_without_georeference_is_refused(tmp_path: Path, write) -> None:
     source = delivered(tmp_path / "m", None, {"a": poses_along(way(3), None)})
     with pytest.raises(InvalidInput, match="has no georeference"):
         write(source, tmp_path, OPTIONS)
+
+
+def test_longitudes_within_range_keep_their_bits() -> None:
+    longitudes = np.random.default_rng(4).uniform(11.0, 12.0, 1000)
+    np.testing.assert_array_equal(wrapped(longitudes), longitudes)
+    np.testing.assert_array_equal(unrolled(longitudes), longitudes)
+    np.testing.assert_allclose(
+        wrapped([180.0, -180.0, 540.0, 179.5, -181.0]), [-180, -180, -180, 179.5, 179.0]
+    )
+    np.testing.assert_allclose(unrolled([179.0, -179.0, 178.0]), [179.0, 181.0, 178.0])
+    np.testing.assert_allclose(unrolled([-179.0, 179.0]), [-179.0, -181.0])
+    assert len(unrolled([])) == 0
+
+
+def test_a_line_that_comes_back_is_cut_twice() -> None:
+    pieces = cut_line([[179.0, 0.0], [-179.0, 2.0], [179.0, 4.0]])
+    assert [piece[:, 0].tolist() for piece in pieces] == [
+        [179.0, 180.0],
+        [-180.0, -179.0, -180.0],
+        [180.0, 179.0],
+    ]
+    assert [piece[:, 1].tolist() for piece in pieces] == [[0.0, 1.0], [1.0, 2.0, 3.0], [3.0, 4.0]]
+    westwards = cut_line([[-179.0, 0.0], [179.0, 2.0]])
+    assert [piece[:, 0].tolist() for piece in westwards] == [[-179.0, -180.0], [180.0, 179.0]]
