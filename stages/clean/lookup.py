@@ -55,9 +55,10 @@ class Verdicts:
         """One table of all; a brick at a border is in two tiles, each with verdicts on its own voxels only."""
         brick = np.concatenate([np.empty(0, np.int64), *(t.brick for t in tables)])
         said = np.concatenate([np.empty((0, BRICK_VOXELS), np.uint8), *(t.verdict for t in tables)])
-        bricks, row = np.unique(brick, return_inverse=True)
-        self._verdict = np.zeros((len(bricks), BRICK_VOXELS), np.uint8)
-        np.maximum.at(self._verdict, row, said)
+        bricks, first, row = np.unique(brick, return_index=True, return_inverse=True)
+        self._verdict = said[first]
+        again = np.setdiff1d(np.arange(len(brick)), first)
+        np.maximum.at(self._verdict, row[again], said[again])
         self._keys, self._rows = brick_table(bricks, len(bricks))
 
 

@@ -193,6 +193,9 @@ def said_of(px: float, py: float, pz: float, starts: I4, returns: F4) -> int:
         b = middle + (step + 1) // 2 * (1 if step % 2 else -1)
         for k in range(starts[b % BINS], starts[b % BINS + 1]):
             far = np.float64(returns[k, 0])
+            behind = far - r
+            if (behind <= -SAME_M and hidden) or (behind >= SAME_M and (passed or far <= r + BEYOND_M)):
+                continue  # tells nothing that is not known
             rise = returns[k, 1] * (r / far) - pz
             if abs(rise) > side:
                 continue
@@ -200,10 +203,10 @@ def said_of(px: float, py: float, pz: float, starts: I4, returns: F4) -> int:
             turn = min(turn, 2.0 * np.pi - turn) * r
             if turn > side:
                 continue
-            if abs(far - r) < SAME_M:
+            if abs(behind) < SAME_M:
                 return -1
             if far < r:
                 hidden = True
-            elif far > r + BEYOND_M and abs(rise) < beside and turn < beside:
+            elif abs(rise) < beside and turn < beside:
                 passed = True
     return 1 if passed and not hidden else 0
