@@ -11,6 +11,7 @@ from scanloom.stages.geometry.boxes import inside_boxes
 from scanloom.stages.geometry.se3 import F8
 
 B1 = NDArray[np.bool_]
+I4 = NDArray[np.int32]
 
 
 class MovingBoxes:
@@ -33,4 +34,11 @@ def boxed(scan: DeskewedScan, boxes: F8, margin_m: float, above_m: float = 0.0) 
     raised = boxes.copy()
     raised[:, [3, 7, 11]] += above_m * boxes[:, [2, 6, 10]]
     raised[:, 14] = np.maximum(boxes[:, 14] - above_m, 0.0)
-    return np.asarray(inside_boxes(scan.x_m, scan.y_m, scan.z_m, raised, margin_m) >= 0)
+    return number_of_box(scan, raised, margin_m) >= 0
+
+
+def number_of_box(scan: DeskewedScan, boxes: F8, margin_m: float) -> I4:
+    """Number (n,) of the box (m, 15) that each point of a scan is within `margin_m` of, -1 for none."""
+    if not len(boxes):
+        return np.full(len(scan), -1, np.int32)
+    return np.asarray(inside_boxes(scan.x_m, scan.y_m, scan.z_m, boxes, margin_m))

@@ -3,8 +3,10 @@
 A point's voxel says whether what the session met there moved or has changed. Of a thing that hangs together in a scan, most
 of which moved, all moved: its wheels, which rays to the ground hardly pass, and its roof before the sky, which none passes.
 What the tracker saw drive about moved as well, wherever its box is; free space alone cannot know of a car that stood where
-nobody looked again. What denoise took for a stray, for dust or for something that moves, and the map knows to stand, is
-restored. Own vehicle and range stay as they are, and ground, but for what of it is too high in a moving box.
+nobody looked again. What is in the air is decided anew, with all that the map knows (`airborne`): dust was seen through before
+and after, too, and the tracker may have followed a cloud. What denoise took for a stray or for something that moves, and the
+map knows to stand, is restored. Own vehicle and range stay as they are, and ground, but for what of it is too high in a moving
+box.
 """
 
 from __future__ import annotations
@@ -21,19 +23,21 @@ from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
 from scanloom.schemas.trajectory import Poses
 from scanloom.stages.clean import incidence
+from scanloom.stages.clean.airborne import Known, airborne
 from scanloom.stages.clean.clusters import clusters
 from scanloom.stages.clean.lookup import Verdicts
-from scanloom.stages.clean.moving import MovingBoxes, boxed
+from scanloom.stages.clean.moving import MovingBoxes, boxed, number_of_box
 from scanloom.stages.geometry.se3 import F8
 
-VERSION = 1
+VERSION = 2
 
 U1 = NDArray[np.uint8]
 B1 = NDArray[np.bool_]
+I4 = NDArray[np.int32]
 I8 = NDArray[np.int64]
-DYNAMIC = int(PointClass.DYNAMIC)
+STATIC, DYNAMIC, AIRBORNE = int(PointClass.STATIC), int(PointClass.DYNAMIC), int(PointClass.AIRBORNE)
 JUDGED = (PointClass.UNLABELLED, PointClass.STATIC, PointClass.DYNAMIC)
-RESTORED = (PointClass.DYNAMIC, PointClass.AIRBORNE, PointClass.OUTLIER)
+RESTORED = (PointClass.DYNAMIC, PointClass.OUTLIER)
 """What denoise took for something else and the map knows to stand."""
 ASKED = (*JUDGED, PointClass.AIRBORNE, PointClass.OUTLIER)
 DECIDED = ((Standing.CHANGED, PointClass.CHANGED), (Standing.MOVED, PointClass.DYNAMIC))
@@ -71,6 +75,11 @@ class Settings(BaseModel):
     )
     foot_m: float = Field(
         0.08, ge=0.0, le=1.0, description="points in such a box this far above its foot are no ground, m"
+    )
+    particles: bool = Field(
+        True,
+        description="decide anew what is in the air, with all that the map knows; else what denoise says of it stays, "
+        "but for what stands",
     )
 
 
@@ -136,18 +145,33 @@ def final(settings: Settings, scan: DeskewedScan, classes: U1, known: _Map) -> U
     if T_world_lidar is None:
         return classes
     said = known.verdicts.of(scan, np.isin(classes, ASKED), T_world_lidar)
-    out = np.where((said == Standing.STANDS) & np.isin(classes, RESTORED), PointClass.STATIC, classes).astype(
-        np.uint8
-    )
+    cell = incidence.fill(scan.x_m, scan.y_m, scan.z_m, known.image)
     boxes = known.moving.of(scan)
-    near, around = (boxed(scan, boxes, m) for m in (settings.box_margin_m, settings.wide_box_margin_m))
-    out[near & np.isin(out, RESTORED)] = DYNAMIC
+    box = number_of_box(scan, boxes, settings.box_margin_m)
+    near, around = box >= 0, boxed(scan, boxes, settings.wide_box_margin_m)
+    if settings.particles:
+        fly = airborne(scan, Known(classes, said, box, around, cell, known.image), settings.apart_m)
+    else:
+        fly = (classes == AIRBORNE) & (said != Standing.STANDS) & ~near
+    out = np.where(fly, AIRBORNE, _without_air(classes, said, near)).astype(np.uint8)
+    out[(out == PointClass.GROUND) & boxed(scan, boxes, settings.box_margin_m, settings.foot_m)] = DYNAMIC
     judged = np.isin(out, JUDGED)
     said[judged & (near | (around & (said != Standing.STANDS)))] = Standing.MOVED
-    said[out == PointClass.DYNAMIC] = Standing.MOVED
-    too_high = boxed(scan, boxes, settings.box_margin_m, settings.foot_m)
-    out[(out == PointClass.GROUND) & too_high] = DYNAMIC
-    cell = incidence.fill(scan.x_m, scan.y_m, scan.z_m, known.image)
+    said[out == DYNAMIC] = Standing.MOVED
+    _decide_things(settings, scan, cell, said, judged, out)
+    return out
+
+
+def _without_air(classes: U1, said: U1, near: B1) -> U1:
+    """Classes (n,), nothing being in the air: what stands is restored, strays in a moving box are its own."""
+    out = classes.copy()
+    out[(classes == AIRBORNE) | ((said == Standing.STANDS) & np.isin(classes, RESTORED))] = STATIC
+    out[near & (out == PointClass.OUTLIER)] = DYNAMIC
+    return out
+
+
+def _decide_things(settings: Settings, scan: DeskewedScan, cell: I4, said: U1, judged: B1, out: U1) -> None:
+    """Write what moved or has changed into the classes `out` (n,), whole things with what is told of most of them."""
     for usable, least in (
         (judged, settings.whole_share),
         (judged & (said != Standing.STANDS), settings.moved_share),
@@ -156,7 +180,6 @@ def final(settings: Settings, scan: DeskewedScan, classes: U1, known: _Map) -> U
         for standing, class_ in DECIDED:
             told = judged & (said == standing)
             out[told | (usable & _of_such(thing, told, settings.least_points, least))] = class_
-    return out
 
 
 def _of_such(thing: NDArray[np.int32], told: B1, least_points: int, least_share: float) -> B1:

@@ -1,0 +1,204 @@
+"""What is in the air, decided with the map: dust over the road goes, leaves and cars that denoise took for dust come back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scanloom.schemas.clean import Standing
+from scanloom.schemas.objects import ObjectTracks
+from scanloom.schemas.scans import PointClass, ScanLabels
+from scanloom.stages.clean import incidence, weights
+from scanloom.stages.clean.airborne import (
+    AFTERWARDS,
+    AIR,
+    ASKED,
+    BOX,
+    FAR,
+    KINDS,
+    NO_STRENGTH,
+    SCAN,
+    STRENGTH,
+    TAKEN,
+    THING,
+    WHAT,
+    Known,
+    airborne,
+    evidence,
+    may_fly,
+    strengths,
+    things,
+)
+from scanloom.stages.clean.relabel import Settings
+from tests.stages.clean.worlds import Drive, car, cleared_of, drive_past, rays_of, relabelled, wall
+
+WALLS = (wall(-20.0, 8.0, 100.0), wall(-20.0, -15.0, 100.0))
+PARKED = car(22.0, 5.0)
+
+
+def cloud(t: float) -> np.ndarray:
+    """Where dust drifts over the road, ahead of the vehicle."""
+    return np.array([[14.0 + 6.0 * t, -1.0, -1.5], [18.0 + 6.0 * t, 3.0, 0.5]])
+
+
+def in_dust(seed: int, called_airborne: float, count: int = 40) -> tuple[Drive, list[np.ndarray]]:
+    """A drive behind a drifting cloud in which some rays end; which of the points of each scan are dust."""
+    rng = np.random.default_rng(seed)
+    drive = drive_past([*WALLS, PARKED], [], count=count, seed=seed)
+    dusty = []
+    for n, scan in enumerate(drive.scans):
+        p, ray = drive.world_points(n), drive.world_points(n) - drive.T[n, :3, 3]
+        low, high = cloud(0.1 * n)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = (low - drive.T[n, :3, 3]) / ray, (high - drive.T[n, :3, 3]) / ray
+        enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+        met = (enter < leave) & (enter > 0) & (leave < 1) & (rng.random(len(p)) < 0.4)
+        at = np.where(met, enter, 0.0) + np.where(met, leave - enter, 0.0) * rng.random(len(p))
+        share = np.where(met, at, 1.0).astype(np.float32)
+        strength = np.where(met, 5.0, 60.0) * rng.uniform(0.8, 1.2, len(p))
+        drive.scans[n] = replace(
+            scan, x_m=scan.x_m * share, y_m=scan.y_m * share, z_m=scan.z_m * share,
+            intensity=strength.astype(np.float32),
+        )  # fmt: skip
+        named = np.where(rng.random(len(p)) < called_airborne, PointClass.AIRBORNE, PointClass.STATIC)
+        kind = np.where(met, named, drive.labels[n].class_).astype(np.uint8)
+        drive.labels[n] = ScanLabels(kind, scan.reference_ns, n)
+        dusty.append(met)
+    return drive, dusty
+
+
+@pytest.mark.parametrize(("called_airborne", "least"), [(0.6, 0.85), (0.9, 0.95)])
+def test_dust_that_denoise_named_in_part_is_named_and_what_stands_is_not(
+    called_airborne: float, least: float
+) -> None:
+    drive, dusty = in_dust(1, called_airborne)
+    final = [label.class_ for label in relabelled(drive, cleared_of(rays_of({"a": drive}))["a"])[0]]
+    dust, found = np.concatenate(dusty), np.concatenate(final) == PointClass.AIRBORNE
+    assert dust.sum() > 2000
+    assert found[dust].mean() > least
+    assert found[~dust].mean() < 0.001
+
+
+def test_what_denoise_took_for_dust_and_stands_is_restored_and_the_rest_of_dust_stays() -> None:
+    drive, dusty = in_dust(2, 1.0)
+    rng = np.random.default_rng(3)
+    wrong = []
+    for n, label in enumerate(drive.labels):
+        mistaken = (label.class_ == PointClass.STATIC) & (rng.random(len(label.class_)) < 0.03)
+        drive.labels[n] = replace(
+            label, class_=np.where(mistaken, PointClass.AIRBORNE, label.class_).astype(np.uint8)
+        )
+        wrong.append(mistaken)
+    final = np.concatenate(
+        [label.class_ for label in relabelled(drive, cleared_of(rays_of({"a": drive}))["a"])[0]]
+    )
+    wrongly, dust = np.concatenate(wrong), np.concatenate(dusty)
+    assert wrongly.sum() > 2000
+    assert (final[wrongly] == PointClass.AIRBORNE).mean() < 0.05
+    assert (final[dust] == PointClass.AIRBORNE).mean() > 0.95
+
+
+def test_without_the_last_word_denoise_is_kept_but_for_what_stands() -> None:
+    drive, _ = in_dust(2, 0.6, count=20)
+    cleared = cleared_of(rays_of({"a": drive}))["a"]
+    final = np.concatenate(
+        [label.class_ for label in relabelled(drive, cleared, settings=Settings(particles=False))[0]]
+    )
+    named = np.concatenate([label.class_ for label in drive.labels]) == PointClass.AIRBORNE
+    assert (final[~named] != PointClass.AIRBORNE).all()
+    assert (final[named] == PointClass.AIRBORNE).mean() > 0.9
+
+
+def test_a_cloud_that_the_tracker_followed_is_air_and_a_car_in_it_moves() -> None:
+    """The box holds the cloud whole; another, as large, a car whose returns denoise took for solid."""
+    drive, dusty = in_dust(4, 0.9)
+
+    def tracked(box_at: object) -> ObjectTracks:
+        T = np.tile(np.eye(4), (len(drive.scans), 1, 1))
+        for n in range(len(T)):
+            low, high = box_at(0.1 * n)  # type: ignore[operator]
+            T[n, :3, 3] = [*(low[:2] + high[:2]) / 2, low[2]]
+        size = box_at(0.0)[1] - box_at(0.0)[0]  # type: ignore[operator]
+        n = len(T)
+        return ObjectTracks(
+            scan_index=np.arange(n), stamp_ns=np.arange(n), track=np.zeros(n, np.int32), T_odom_object=T,
+            T_lidar_object=np.linalg.inv(drive.T) @ T, length_m=np.full(n, size[0]), width_m=np.full(n, size[1]),
+            height_m=np.full(n, size[2]), speed_m_s=np.full(n, 6.0), class_=np.ones(n, np.uint8),
+            dynamic=np.ones(n, bool), score=np.ones(n),
+        )  # fmt: skip
+
+    cleared = cleared_of(rays_of({"a": drive}))["a"]
+    dust = np.concatenate(dusty)
+    final = np.concatenate([label.class_ for label in relabelled(drive, cleared, tracked(cloud))[0]])
+    assert (final[dust] == PointClass.AIRBORNE).mean() > 0.9
+    solid = [
+        replace(label, class_=np.where(d, PointClass.STATIC, label.class_).astype(np.uint8))
+        for label, d in zip(drive.labels, dusty)
+    ]
+    drive.labels[:] = solid
+    final = np.concatenate([label.class_ for label in relabelled(drive, cleared, tracked(cloud))[0]])
+    assert (final[dust] == PointClass.DYNAMIC).mean() > 0.95
+
+
+def test_in_clear_air_nothing_is_in_it() -> None:
+    drive = drive_past([*WALLS, PARKED], [lambda t: car(45.0 - 10.0 * t, 2.0)])
+    final = relabelled(drive, cleared_of(rays_of({"a": drive}))["a"])[0]
+    assert sum(int((label.class_ == PointClass.AIRBORNE).sum()) for label in final) == 0
+
+
+def test_ground_and_what_both_agree_on_is_not_asked_about() -> None:
+    solid = [PointClass.STATIC, PointClass.UNLABELLED]
+    assert not ASKED[:, PointClass.GROUND].any()
+    assert not ASKED[:, [PointClass.EGO, PointClass.OUT_OF_RANGE]].any()
+    assert not ASKED[Standing.STANDS, solid].any()
+    assert ASKED[Standing.STANDS, [PointClass.DYNAMIC, PointClass.AIRBORNE, PointClass.OUTLIER]].all()
+    assert ASKED[np.ix_([Standing.UNKNOWN, Standing.MOVED, Standing.CHANGED], solid)].all()
+    assert (TAKEN.shape, AFTERWARDS.shape) == ((len(Standing), len(PointClass)), (len(Standing),))
+
+
+def known_of(drive: Drive, said: np.ndarray) -> Known:
+    scan, n = drive.scans[0], len(drive.scans[0])
+    image = incidence.new_image()
+    cell = incidence.fill(scan.x_m, scan.y_m, scan.z_m, image)
+    return Known(drive.labels[0].class_, said, np.full(n, -1, np.int32), np.zeros(n, bool), cell, image)
+
+
+def test_evidence_stays_within_its_tables() -> None:
+    drive, _ = in_dust(5, 0.5, count=1)
+    rng = np.random.default_rng(0)
+    known = known_of(drive, rng.integers(0, 4, len(drive.scans[0])).astype(np.uint8))
+    asked = np.flatnonzero(may_fly(known.classes, known.said))
+    taken = TAKEN[known.said, known.classes]
+    strength = strengths(drive.scans[0], known, asked)
+    found = evidence(drive.scans[0], known, things(drive.scans[0], known, 0.4), strength, taken, asked)
+    assert found.shape == (len(asked), KINDS)
+    assert found.max() < weights.BINS
+    assert found[:, STRENGTH].max() < NO_STRENGTH
+    assert len(np.unique(found[:, WHAT])) >= 5
+    assert found[:, THING].max() <= 34
+    assert found[:, FAR].max() <= 14
+    assert (found[:, BOX] == 6).all()
+    assert len(np.unique(found[:, SCAN])) == 1
+    assert (taken == AIR).sum() > 10
+
+
+@pytest.mark.parametrize("intensity", [0.0, np.nan])
+def test_a_sensor_that_tells_no_intensity_is_not_asked_for_it(intensity: float) -> None:
+    drive, _ = in_dust(6, 0.5, count=1)
+    scan = replace(drive.scans[0], intensity=np.full(len(drive.scans[0]), intensity, np.float32))
+    known = known_of(drive, np.ones(len(scan), np.uint8))
+    assert (strengths(scan, known, np.arange(len(scan))) == NO_STRENGTH).all()
+    assert airborne(scan, known, 0.4).shape == (len(scan),)
+
+
+def test_an_intensity_that_is_rounded_off_tells_nothing() -> None:
+    drive, dusty = in_dust(6, 0.5, count=1)
+    scan, dust = drive.scans[0], dusty[0]
+    known = known_of(drive, np.where(dust, 0, 1).astype(np.uint8))
+    rows = np.flatnonzero(dust)
+    assert (strengths(scan, known, rows) < NO_STRENGTH).all()
+    rounded = scan.intensity.copy()
+    rounded[dust], rounded[np.flatnonzero(~dust)[::16]] = 0.0, 0.0
+    assert (strengths(replace(scan, intensity=rounded), known, rows) == NO_STRENGTH).all()
