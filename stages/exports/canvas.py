@@ -54,8 +54,8 @@ class Canvas:
         return int(self._low[0]), int(self._low[1]), int(rows), int(columns)
 
     def cells_of(self, xy: F8) -> I8:
-        """Row and column (n, 2) of points (n, 2)."""
-        return np.asarray(np.floor(xy[:, ::-1] / self.cell), np.int64)
+        """Rows and columns (2, n) of points (n, 2)."""
+        return np.floor(np.ascontiguousarray(xy[:, ::-1].T) / self.cell).astype(np.int64)
 
     def paint(self, xy: F8, values: F8) -> None:
         """Add values (n,) at places (n, 2), metres; in their order, so that sums are the same on every machine."""
@@ -63,7 +63,7 @@ class Canvas:
             return
         cells = self.cells_of(xy)
         self._grow(cells)
-        first = cells.min(axis=0) // BLOCK
+        first = cells.min(axis=1) // BLOCK
         keys = _keys(cells, first)
         order = np.argsort(keys, kind="stable")
         keys, taken = keys[order], values[order]
@@ -83,7 +83,7 @@ class Canvas:
         if not len(xy):
             return found
         cells = self.cells_of(xy)
-        first = cells.min(axis=0) // BLOCK
+        first = cells.min(axis=1) // BLOCK
         keys, which = np.unique(_keys(cells, first), return_inverse=True)
         highest = np.empty(len(keys), np.float32)
         for block, at, run in self._runs(keys, first):
@@ -114,7 +114,7 @@ class Canvas:
             yield block.reshape(-1), keys[begin:end] % BLOCK**2, slice(int(begin), int(end))
 
     def _grow(self, cells: I8) -> None:
-        low, high = cells.min(axis=0), cells.max(axis=0)
+        low, high = cells.min(axis=1), cells.max(axis=1)
         self._low = low if self._low is None else np.minimum(self._low, low)
         self._high = high if self._high is None else np.maximum(self._high, high)
 
@@ -142,9 +142,9 @@ def blank(shape: tuple[int, int]) -> NDArray[np.void]:
 
 
 def _keys(cells: I8, first: I8) -> I8:
-    """One number per cell (n, 2): its block, counted from a first one, then row and column in the block."""
-    row, column = (cells // BLOCK - first).T
-    inner_row, inner_column = (cells % BLOCK).T
+    """One number per cell (2, n): its block, counted from a first one, then row and column in the block."""
+    row, column = cells // BLOCK - first[:, None]
+    inner_row, inner_column = cells % BLOCK
     return np.asarray(((row * ACROSS + column) * BLOCK + inner_row) * BLOCK + inner_column, np.int64)
 
 

@@ -51,7 +51,7 @@ MEDIA_TYPES = {
 }
 RECORD = "exports.json"
 """What the exports of a map are on record in, beside their folders."""
-WITH_A_SYSTEM_OF_ITS_OWN = {
+WITH_A_SYSTEM_OF_ITS_OWN: dict[str, str | None] = {
     "tum": None,
     "kitti": None,
     "gpx": "EPSG:4326",

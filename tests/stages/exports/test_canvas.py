@@ -58,7 +58,7 @@ def test_borders_of_blocks_belong_to_the_higher_one(tmp_path: Path) -> None:
     edge = BLOCK * 0.5
     xy = np.array([[edge, -edge], [np.nextafter(edge, 0.0), np.nextafter(-edge, -np.inf)], [0.0, -0.0]])
     canvas = painted(tmp_path, xy, np.arange(3.0))
-    np.testing.assert_array_equal(canvas.cells_of(xy), [[-BLOCK, BLOCK], [-BLOCK - 1, BLOCK - 1], [0, 0]])
+    np.testing.assert_array_equal(canvas.cells_of(xy).T, [[-BLOCK, BLOCK], [-BLOCK - 1, BLOCK - 1], [0, 0]])
     assert canvas.window(-BLOCK, BLOCK, 1, 1)["sum"][0, 0] == 0.0
     assert canvas.window(-BLOCK - 1, BLOCK - 1, 1, 1)["sum"][0, 0] == 1.0
     assert canvas.window(0, 0, 1, 1)["sum"][0, 0] == 2.0
