@@ -365,6 +365,13 @@ def export(
     per_tile: Annotated[
         bool, typer.Option("--per-tile", help="LAZ: one file per tile besides the whole map.")
     ] = False,
+    cell_m: Annotated[
+        float | None, typer.Option("--cell-m", help="Rasters: edge of a cell, m (default 0.25).")
+    ] = None,
+    fill_cells: Annotated[
+        int | None,
+        typer.Option("--fill-cells", help="Ground heights: cells to interpolate into holes (default 4)."),
+    ] = None,
     list_all: Annotated[bool, typer.Option("--list", help="Only say which formats there are.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -376,7 +383,13 @@ def export(
         _emit(rows) if as_json else print("\n".join(f"{row['format']:11} {row['doc']}" for row in rows))
         return
     options = options_of(
-        epsg=epsg, heights=heights.value, vertical_epsg=vertical_epsg, removed=removed, per_tile=per_tile
+        epsg=epsg,
+        heights=heights.value,
+        vertical_epsg=vertical_epsg,
+        removed=removed,
+        per_tile=per_tile,
+        cell_m=cell_m,
+        fill_cells=fill_cells,
     )
     done = export_map(folder, formats, options, out)
     if as_json:

@@ -204,7 +204,7 @@ def _assets(source: MapSource, item_folder: Path, code: str | None) -> Iterator[
     for name, (title, roles) in about.items():
         path = source.folder / name
         if path.is_file() and path.suffix != ".tum":
-            place = {} if path.suffix in LOOKED_AT else {"proj:code": None}
+            place: dict[str, Any] = {} if path.suffix in LOOKED_AT else {"proj:code": None}
             known = source.header.get("files", {}).get(name, {})
             yield name, _asset(path, item_folder, title, roles, known, place)
     for export, row in exports_of(source, item_folder.parent).items():
