@@ -191,6 +191,8 @@ class NodeReader:
         if not self._overview.exists():
             return self.levels.top + 1
         rows = pq.ParquetFile(self._overview).metadata.num_rows
+        if not rows:
+            return self.levels.top + 1
         down_to = np.cumsum(self.levels.points.sum(axis=0)[::-1])[::-1]
         fits = np.flatnonzero(down_to == rows)
         if not len(fits):

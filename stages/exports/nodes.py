@@ -130,7 +130,9 @@ def _below(levels: Levels, tiles: I8, level: int) -> Iterator[Node]:
         return
     shift = level - levels.of_tile
     if shift < 0:
-        yield from (_door(levels, int(tile)) for tile in tiles if np.isfinite(levels.low_m[tile, level, 0]))
+        yield from (
+            _door(levels, int(tile), level) for tile in tiles if np.isfinite(levels.low_m[tile, level, 0])
+        )
         return
     tiles = tiles[np.isfinite(levels.low_m[tiles, level, 0])]
     squares, member = np.unique(levels.place[tiles] >> shift, axis=0, return_inverse=True)
@@ -156,9 +158,8 @@ def _block(
     )
 
 
-def _door(levels: Levels, tile: int) -> Node:
-    """What stands for the nodes within a tile until they are asked for."""
-    level = door_level(levels)
+def _door(levels: Levels, tile: int, level: int) -> Node:
+    """What stands for the nodes within a tile, of a level and below, until they are asked for."""
     return Node(
         name=levels.names[tile],
         finest=0,

@@ -39,6 +39,7 @@ def test_everything_is_delivered(mapped: Path) -> None:
         "map.ply",
         "removed.ply",
         "objects.parquet",
+        "loops.parquet",
         "trajectory.parquet",
         "trajectory.tum",
         "metrics.json",

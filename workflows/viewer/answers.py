@@ -11,7 +11,7 @@ import numpy as np
 
 from scanloom.schemas.scans import PointClass
 from scanloom.stages.exports.node_points import NodeReader, Points
-from scanloom.stages.exports.nodes import Node
+from scanloom.stages.exports.nodes import ROOT_POINTS, Node
 from scanloom.stages.exports.source import MapSource
 from scanloom.stages.exports.tiles3d import map_tileset, tile_tileset
 from scanloom.stages.geometry.geodesy import world_to_geodetic, world_to_projected
@@ -22,6 +22,9 @@ Json = dict[str, Any]
 SPREAD_PERCENT = (1.0, 99.0)
 """Colours span heights and intensities between these percentiles."""
 
+MOST_PERCENT = (0.5, 99.5)
+"""The first view shows what lies between these percentiles along each axis: a few stray points do not make the map small."""
+
 
 class Missing(Exception):
     """There is nothing of that name."""
@@ -30,9 +33,9 @@ class Missing(Exception):
 class Answers:
     """Read-only view of one map. May be asked by several threads."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, root_points: int = ROOT_POINTS) -> None:
         self.source = MapSource.open(folder)
-        self.reader = NodeReader(self.source)
+        self.reader = NodeReader(self.source, root_points=root_points)
         self.layers = Layers(self.source)
         self.removed = Removed(self.source)
         self._blocks = {node.name: node for node in self.reader.root.walk()}
@@ -106,6 +109,7 @@ class Answers:
                 "epsg": georeference.epsg if georeference else None,
                 "min_m": root.min_m,
                 "max_m": root.max_m,
+                "most_m": np.percentile(sample.xyz_m, MOST_PERCENT, axis=0).tolist(),
                 "voxel_size_m": source.index.voxel_size_m,
                 "sessions": self.reader.sessions,
                 "height_m": _spread(sample.xyz_m[:, 2]),

@@ -74,7 +74,9 @@ class Removed:
         """A root with every n-th point, below it the rest of each tile; points of a tile follow each other."""
         points = self._points
         tile = np.floor(np.column_stack((points["x"], points["y"])) / self._tile_m)
-        firsts: Any = np.flatnonzero(np.append(True, (tile[1:] != tile[:-1]).any(axis=1))) if len(points) else []
+        firsts: Any = (
+            np.flatnonzero(np.append(True, (tile[1:] != tile[:-1]).any(axis=1))) if len(points) else []
+        )
         children = [
             self._node(str(first), int(first), int(last))
             for first, last in zip(firsts, [*firsts[1:], len(points)])

@@ -4,7 +4,7 @@ import { Vector3 } from "./vendor.js";
 import { Cloud, MODES, pointMaterial } from "./cloud.js";
 import { lineLayers } from "./layers.js";
 import { Overlay } from "./measure.js";
-import { $, colourButtons, describeMap, layerSwitch, number, pointRows, showCard, showMode } from "./panel.js";
+import { $, classColours, colourButtons, describeMap, layerSwitch, number, objectColours, pointRows, showCard, showMode } from "./panel.js";
 import { pick } from "./picking.js";
 import { View } from "./scene.js";
 
@@ -25,8 +25,8 @@ class App {
     this.removed = null;
     this.overlay = new Overlay($("overlay"), view);
     view.scene.add(this.cloud.group);
-    this.low = new Vector3(...map.min_m);
-    this.high = new Vector3(...map.max_m);
+    this.low = new Vector3(...map.most_m[0]);
+    this.high = new Vector3(...map.most_m[1]);
     this.opened = performance.now();
   }
 
@@ -146,9 +146,10 @@ class App {
   }
 
   status() {
-    const shown = this.cloud.shown + (this.removed ? this.removed.shown : 0);
+    const shown = this.cloud.shown;
+    const removed = this.removed?.shown ? ` · ${number(this.removed.shown)} removed` : "";
     const failed = this.cloud.failed ? ` · ${this.cloud.failed} parts could not be read` : "";
-    $("count").textContent = `${number(shown)} of ${number(this.map.points)} points${this.cloud.busy ? " …" : ""}${failed}`;
+    $("count").textContent = `${number(shown)} of ${number(this.map.points)} points${removed}${this.cloud.busy ? " …" : ""}${failed}`;
     const { isTop, perMetre, renderer } = this.view;
     $("scale").hidden = !isTop;
     if (!isTop) return;
@@ -234,9 +235,9 @@ async function addLayers(app) {
     const group = groups[name];
     group.visible = on;
     app.view.lines.add(group);
-    layerSwitch(name, text, data[name].length, on, (shown) => { group.visible = shown; app.dirty = true; });
+    layerSwitch(name, text, data[name].length, on, (shown) => { group.visible = shown; app.dirty = true; }, name === "objects" ? objectColours(data.objects) : []);
   }
-  layerSwitch("removed", "Removed points", app.map.removed.points, false, (on) => app.showRemoved(on));
+  layerSwitch("removed", "Removed points", app.map.removed.points, false, (on) => app.showRemoved(on), classColours(app.map.removed.classes));
   app.dirty = true;
 }
 

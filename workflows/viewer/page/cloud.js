@@ -74,7 +74,7 @@ export class Cloud {
     this.base = base;
     this.material = material;
     this.loaded = 0;
-    this.wanted = 2.0;
+    this.wanted = 1.2;
     this.failed = 0;
     this.tiles = new TilesRenderer(`${base}tileset.json`);
     this.tiles.errorTarget = this.wanted;

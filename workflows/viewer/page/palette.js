@@ -5,7 +5,7 @@ import { Color, DataTexture } from "./vendor.js";
 // Turbo (Mikhailov, Google 2019), every sixteenth entry; and greys.
 const TURBO = ["#30123b", "#4145ab", "#4675ed", "#39a2fc", "#1bcfd4", "#24eca6", "#61fc6c", "#a4fc3b", "#d1e834", "#f3c63a", "#fe9b2d", "#f36315", "#d93806", "#b11901", "#7a0402"];
 const VIRIDIS = ["#440154", "#482475", "#414487", "#355f8d", "#2a788e", "#21918c", "#22a884", "#44bf70", "#7ad151", "#bddf26", "#fde725"];
-const GREY = ["#1c1c1c", "#ffffff"];
+const GREY = ["#2e3338", "#8d9296", "#ffffff"];
 
 export const RAMPS = { height: TURBO, intensity: GREY, count: VIRIDIS };
 

@@ -57,11 +57,15 @@ function swatches(entries) {
   }));
 }
 
-export function layerSwitch(name, text, count, on, change) {
+// A layer with its number of things; `colours` are pairs of a name and a colour, shown while it is on.
+export function layerSwitch(name, text, count, on, change, colours = []) {
   const box = element("input", { type: "checkbox", checked: on && count > 0, disabled: count === 0, "data-layer": name });
-  box.addEventListener("change", () => change(box.checked));
+  const legend = swatches(colours);
+  legend.classList.add("under");
+  legend.hidden = !colours.length || !box.checked;
+  box.addEventListener("change", () => { legend.hidden = !colours.length || !box.checked; change(box.checked); });
   const label = element("label", { class: count ? "check" : "check off" }, box, element("span", {}, text), element("small", {}, count ? number(count) : "none"));
-  $("layers").append(label);
+  $("layers").append(label, legend);
   return box;
 }
 
@@ -95,4 +99,5 @@ function time(ns) {
   return new Date(ms).toISOString().replace("T", " ").replace("Z", " UTC");
 }
 
-export const objectLegend = (classes) => classes.map((name) => [name, OBJECTS[name]]);
+export const objectColours = (things) => [...new Set(things.map((thing) => thing.class))].map((name) => [name, OBJECTS[name]]);
+export const classColours = (classes) => Object.values(classes).map((name) => [name, CLASSES[name]]);

@@ -114,7 +114,7 @@ export class View {
     this.top.position.set(seen.x, seen.y, high.z + this.extent);
     this.controls.top.target.copy(seen);
     const away = half / Math.tan((FIELD_OF_VIEW * Math.PI) / 360);
-    this.perspective.position.copy(seen).add(new Vector3(0, -0.62, 0.78).multiplyScalar(away * 0.95));
+    this.perspective.position.copy(seen).add(new Vector3(0, -0.62, 0.78).multiplyScalar(away * 0.9));
     this.controls.perspective.target.copy(seen);
     this.resize(this.size.x, this.size.y, this.renderer.getPixelRatio());
     for (const controls of Object.values(this.controls)) controls.update();
