@@ -31,6 +31,10 @@ class MetricKind:
     """Whether truth is needed to compute it."""
     target: float = 0.0
     """The best value, when `better` says so."""
+    absent: float | None = None
+    """What it means when the metric is not there; None when that means nothing."""
+    varies: bool = False
+    """Depends on the machine and what else it does: judged only when its noise has been measured."""
 
     def badness(self, value: float) -> float:
         """Grows as the metric gets worse; 0 for one that is neither."""
@@ -112,7 +116,7 @@ METRICS: tuple[MetricKind, ...] = (
     MetricKind("odometry.unreliable_scans", "scans whose motion was bridged by prediction", "lower", 5.0, 0.2),
     MetricKind("odometry.degenerate_share", "share of scans with a direction of motion that went unseen", "lower", 0.02, 0.2),
     MetricKind("odometry.degenerate_longest_m", "longest way with a direction of motion that went unseen", "lower", 5.0, 0.2),
-    MetricKind("odometry.segments", "parts between which the motion was lost; none when it never was", "lower"),
+    MetricKind("odometry.segments", "parts between which the motion was lost; none when it never was", "lower", absent=1.0),
     MetricKind("loops.candidates", "pairs of places compared"),
     MetricKind("loops.verified", "pairs that passed the geometric tests"),
     MetricKind("loops.accepted", "pairs that the pose graph uses", "higher", 2.0, 0.2),
@@ -145,10 +149,10 @@ METRICS: tuple[MetricKind, ...] = (
     MetricKind("clean.*_share", "share of the points left out of the map, by class"),
     MetricKind("changes.points", "standing points of the old map that new sessions saw through"),
     MetricKind("changes.objects", "such points gathered by distance"),
-    MetricKind("run.wall_s", "from the start of the command to the delivery of the map", "lower", 5.0, 0.3),
+    MetricKind("run.wall_s", "from the start of the command to the delivery of the map", "lower", 5.0, 0.3, varies=True),
     MetricKind("run.log_s", "length of all logs"),
-    MetricKind("run.realtime_factor", "seconds of log per second of run", "higher", 0.2, 0.3),
-    MetricKind("run.peak_rss_mb", "resident memory of all processes together", "lower", 200.0, 0.25),
+    MetricKind("run.realtime_factor", "seconds of log per second of run", "higher", 0.2, 0.3, varies=True),
+    MetricKind("run.peak_rss_mb", "resident memory of all processes together", "lower", 200.0, 0.25, varies=True),
     MetricKind("run.tasks*", "tasks of the run"),
 )
 # fmt: on

@@ -338,6 +338,42 @@ def nightly(
 
 
 @app.command()
+def compare(
+    maps: Annotated[
+        list[Path], typer.Argument(metavar="MAP_A MAP_B", help="Two finished maps; B is judged.")
+    ],
+    noise: Annotated[
+        list[Path] | None,
+        typer.Option("--noise", help="A file of noise, or three or more maps of the same log (repeated)."),
+    ] = None,
+    measure_noise: Annotated[
+        Path | None,
+        typer.Option(
+            "--measure-noise", help="Write the noise of all maps given, at least three, to this file."
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Two maps side by side; exit code 5 when the second is worse by more than noise."""
+    from scanloom.schemas.errors import UsageError
+    from scanloom.workflows.compare_maps import compare_maps, noise_of
+    from scanloom.workflows.comparison_text import text_of_comparison, text_of_noise
+
+    if measure_noise is not None:
+        found_noise = noise_of(maps)
+        found_noise.write(measure_noise)
+        _emit(found_noise.as_json()) if as_json else print(text_of_noise(found_noise))
+        return
+    if len(maps) != 2:
+        raise UsageError(
+            f"{len(maps)} maps were given, not two", next_step="say scanloom compare MAP_A MAP_B"
+        )
+    found = compare_maps(maps[0], maps[1], noise or [])
+    _emit(found.as_json()) if as_json else print(text_of_comparison(found))
+    raise typer.Exit(found.exit_code)
+
+
+@app.command()
 def export(
     folder: Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a finished map.")],
     formats: Annotated[

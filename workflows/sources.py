@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from scanloom.pipeline.identity import git_commit
 from scanloom.pipeline.run import Result
 from scanloom.pipeline.settings import resolve
 from scanloom.pipeline.store import Store
@@ -48,6 +50,8 @@ class Sources(BaseModel):
     settings: dict[str, dict[str, Any]]
     """Of the project file and the command line, merged."""
     store: str
+    program: str = ""
+    """Version of the program, and the commit where it ran from a checkout."""
 
 
 def write_sources(
@@ -58,7 +62,10 @@ def write_sources(
         SourceOfSession(name=s.name, word=s.word, settings=_lasting_settings(s, settings)) for s in sessions
     )
     kept = _without_mode(settings)
-    sources = Sources(format=SOURCES_FORMAT, sessions=rows, settings=kept, store=str(store.resolve()))
+    program = " ".join(filter(None, (metadata.version("scanloom"), git_commit()[:12])))
+    sources = Sources(
+        format=SOURCES_FORMAT, sessions=rows, settings=kept, store=str(store.resolve()), program=program
+    )
     write_text(out / SOURCES_FILE, sources.model_dump_json(indent=1) + "\n")
 
 
