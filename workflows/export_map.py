@@ -18,7 +18,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from scanloom.schemas.errors import StoreError, UsageError
-from scanloom.stages.exports.clouds import points_of
+from scanloom.stages.exports.clouds import box_of, points_of
 from scanloom.stages.exports.coordinates import Projector
 from scanloom.stages.exports.formats import FORMATS, Format, chosen
 from scanloom.stages.exports.options import Options
@@ -185,7 +185,7 @@ def _facts(source: MapSource, entry: Format, options: Options) -> Row:
             "heights": projector.heights,
             "operation": projector.operation,
         },
-        "box_m": projector.box(source).tolist(),
+        "box_m": box_of(source, projector, options).tolist(),
         "what": entry.doc,
     }
 

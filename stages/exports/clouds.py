@@ -51,7 +51,7 @@ class Cloud:
 def points_of(source: MapSource, options: Options) -> int:
     """How many points `clouds` gives."""
     left_out = (pq.read_metadata(path).num_rows for path in _removed_files(source, options))
-    return source.points + sum(left_out)
+    return source.points + sum(map(int, left_out))
 
 
 def clouds(source: MapSource, projector: Projector, options: Options) -> Iterator[Cloud]:
@@ -76,6 +76,34 @@ def part_file(source: MapSource, name: str) -> Path:
     if name.endswith(REMOVED):
         return source.folder / "removed" / f"{name.removesuffix(REMOVED)}.parquet"
     return source.folder / "tiles" / f"{name}.parquet"
+
+
+def part_boxes(source: MapSource, options: Options) -> dict[str, tuple[F8, F8]]:
+    """Lowest and highest corner, in the map's frame, of the points of each of `part_names` that has any."""
+    index = source.index
+    boxes = {
+        name: (index.min_m[rows].min(axis=0), index.max_m[rows].max(axis=0))
+        for name, rows in index.by_tile().items()
+    }
+    for path in _removed_files(source, options):
+        tile = RemovedTile.open(path)
+        if len(tile):
+            local = np.array([[axis.min(), axis.max()] for axis in (tile.x_m, tile.y_m, tile.z_m)], float)
+            low, high = local.T + np.array(tile.offset_m)
+            boxes[f"{path.stem}{REMOVED}"] = (low, high)
+    return boxes
+
+
+def box_of(source: MapSource, projector: Projector, options: Options) -> F8:
+    """Lowest and highest corner (2, 3) of a box around all points of an export, m.
+
+    It encloses the corners of the tiles' own boxes, hence reaches over the points by as much as the axes are turned.
+    """
+    boxes = list(part_boxes(source, options).values())
+    if not boxes:
+        return np.zeros((2, 3))
+    corners = projector.corners([low for low, _ in boxes], [high for _, high in boxes])
+    return np.stack((corners.min(axis=0), corners.max(axis=0)))
 
 
 def part(source: MapSource, name: str) -> Tile:
@@ -106,4 +134,4 @@ def round_offset_m(source: MapSource, projector: Projector) -> F8:
     if len(source.index) == 0:
         return np.zeros(3)
     middle = (source.index.min_m.min(axis=0) + source.index.max_m.max(axis=0)) / 2.0
-    return np.round(projector.project(middle)[0] / 100.0) * 100.0
+    return np.asarray(np.round(projector.project(middle)[0] / 100.0) * 100.0)

@@ -149,18 +149,13 @@ class Projector:
         patch = Patch.fit(self, points.min(axis=0), points.max(axis=0))
         return self.project(points) if patch.residual_m > TOLERANCE_M else patch(points)
 
-    def box(self, source: MapSource) -> F8:
-        """Lowest and highest corner (2, 3) of a box around all points of the map, m.
-
-        It encloses the corners of the tiles' own boxes, hence reaches over the points by as much as the axes are turned.
-        """
-        low, high = source.index.min_m, source.index.max_m
-        if len(low) == 0:
-            return np.zeros((2, 3))
-        picks = itertools.product((low, high), repeat=3)
-        corners = np.concatenate([np.column_stack((x[:, 0], y[:, 1], z[:, 2])) for x, y, z in picks])
-        placed = self.project(corners)
-        return np.stack((placed.min(axis=0), placed.max(axis=0)))
+    def corners(self, low: ArrayLike, high: ArrayLike) -> F8:
+        """The eight corners (8 n, 3) of boxes (n, 3) of the map's frame, m."""
+        box = np.atleast_2d(low), np.atleast_2d(high)
+        picks = itertools.product(box, repeat=3)
+        return self.project(
+            np.concatenate([np.column_stack((x[:, 0], y[:, 1], z[:, 2])) for x, y, z in picks])
+        )
 
     def axes(self, place: ArrayLike) -> F8:
         """Rotation (3, 3) of directions of the map's frame at a place (3,) into the export's axes: mostly grid convergence."""
@@ -177,8 +172,7 @@ class Projector:
         ------
         UsageError : PROJ knows no exact way to the system, or the way needs a grid that is not there.
         """
-        from pyproj.aoi import AreaOfInterest
-        from pyproj.transformer import TransformerGroup
+        from pyproj.transformer import AreaOfInterest, TransformerGroup
 
         if self.georeference is None:
             return None
@@ -219,7 +213,9 @@ class Patch:
         middle, half = (low + high) / 2.0, np.maximum((high - low) / 2.0, 1e-3)
         nodes = np.cos((2.0 * np.arange(4) + 1.0) * np.pi / 8.0)
         at = np.array(list(itertools.product(nodes, repeat=3)))
-        coefficients = np.linalg.lstsq(_terms(at), projector.project(middle + half * at), rcond=None)[0]
+        coefficients = np.asarray(
+            np.linalg.lstsq(_terms(at), projector.project(middle + half * at), rcond=None)[0], np.float64
+        )
         check = np.array(list(itertools.product(np.linspace(-1.0, 1.0, 5), repeat=3)))
         wrong = _terms(check) @ coefficients - projector.project(middle + half * check)
         return cls(middle, half, coefficients, float(np.abs(wrong).max()))
@@ -286,7 +282,7 @@ def _compound(epsg: int, vertical_epsg: int) -> Any:
 
 
 def _grid_is_missing(projector: Projector, operations: list[Any]) -> UsageError:
-    from pyproj.datadir import get_user_data_dir
+    from pyproj.datadir import get_user_data_dir  # type: ignore[attr-defined]
 
     grids = [grid for grid in operations[0].grids if not grid.available] if operations else []
     names = ", ".join(grid.short_name for grid in grids) or "one that PROJ does not name"

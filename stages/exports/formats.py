@@ -15,6 +15,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from scanloom.schemas.errors import UsageError
+from scanloom.stages.exports.autoware import write_autoware
+from scanloom.stages.exports.copc import write_copc
 from scanloom.stages.exports.dem import write_dem
 from scanloom.stages.exports.geojson import write_geojson
 from scanloom.stages.exports.geoparquet import write_geoparquet
@@ -53,6 +55,16 @@ _ROWS: tuple[Format, ...] = (
     Format("ply", "whole map with all columns, float32 from an offset", write_ply),
     Format("pcd", "whole map as x y z intensity class, float32 from an offset", write_pcd),
     Format("laz", "whole map as LAZ 1.4 with its coordinate system", write_laz, "las", ("laspy", "lazrs")),
+    Format(
+        "copc",
+        "the same as COPC 1.0, to stream by level of detail",
+        write_copc,
+        "las",
+        ("laspy", "lazrs"),
+    ),
+    Format(
+        "autoware", "map folder of Autoware: PCD on a grid of 20 m and its place on the Earth", write_autoware
+    ),
     Format("3dtiles", "whole map as 3D Tiles 1.1 with glTF contents, on the globe", write_3d_tiles),
     Format("tum", "trajectory as text of TUM, in the map's frame", write_tum),
     Format(

@@ -7,7 +7,7 @@ from typing import Any
 
 from scanloom.stages.exports.clouds import clouds
 from scanloom.stages.exports.coordinates import Projector
-from scanloom.stages.exports.las_points import POINT_FORMAT, Records, describe
+from scanloom.stages.exports.las_points import Records, Rows, las_header
 from scanloom.stages.exports.options import Options
 from scanloom.stages.exports.source import MapSource
 
@@ -33,12 +33,10 @@ def write_laz(source: MapSource, folder: Path, options: Options) -> list[Path]:
 def _open(path: Path, projector: Projector, records: Records) -> Any:
     import laspy
 
-    header = laspy.LasHeader(version="1.4", point_format=POINT_FORMAT)
-    describe(header, projector, records)
-    return laspy.open(path, mode="w", header=header, do_compress=True)
+    return laspy.open(path, mode="w", header=las_header(projector, records), do_compress=True)
 
 
-def _write(writer: Any, rows: Any) -> None:
+def _write(writer: Any, rows: Rows) -> None:
     import laspy
 
     if len(rows):

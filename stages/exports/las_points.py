@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from datetime import UTC, date, datetime
+from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -18,8 +19,8 @@ from scanloom.stages.exports.options import Options
 from scanloom.stages.exports.source import MapSource
 
 F8 = NDArray[np.float64]
+Rows = NDArray[np.void]
 
-POINT_FORMAT = 6
 SCALE_M = 0.001
 RECORD = np.dtype(
     [
@@ -80,18 +81,25 @@ class Records:
     intensity_scale: float
     unix_time: bool
     """Whether stamps are seconds since 1970; else `gps_time` is the log's own clock, s."""
+    last_day: date
+    """Of the last stamp; files are dated so, since two exports of one map shall be the same bytes."""
+
+    point_format: ClassVar[int] = 6
+    standard_bytes: ClassVar[int] = 30
+    """Of a record of that format; the extra bytes follow."""
 
     @classmethod
     def of(cls, source: MapSource, projector: Projector, options: Options) -> Records:
         """Offset, scale of intensities and kind of time, from the whole map."""
-        strongest, earliest_ns = _survey(source, part_names(source, options))
+        strongest, first_ns, last_ns = _survey(source, part_names(source, options))
         return cls(
-            round_offset_m(source, projector),
-            intensity_scale(strongest),
-            earliest_ns is None or earliest_ns >= GPS_EPOCH_S * NS_PER_S,
+            offset_m=round_offset_m(source, projector),
+            intensity_scale=intensity_scale(strongest),
+            unix_time=first_ns >= GPS_EPOCH_S * NS_PER_S,
+            last_day=datetime.fromtimestamp(last_ns // NS_PER_S, UTC).date(),
         )
 
-    def __call__(self, cloud: Cloud) -> NDArray[np.void]:
+    def __call__(self, cloud: Cloud) -> Rows:
         """Packed rows (n,) of `RECORD`."""
         tile = cloud.tile
         out = np.zeros(len(cloud), RECORD)
@@ -129,17 +137,27 @@ def gps_time(stamp_ns: NDArray[np.int64]) -> F8:
     return np.asarray((stamp_ns - shift_ns + leaps * NS_PER_S) / NS_PER_S, np.float64)
 
 
-def describe(header: Any, projector: Projector, records: Records) -> None:
-    """Fill a header of laspy: version, scale, offset, coordinate system, kind of time, extra bytes."""
-    from laspy import ExtraBytesParams
+def places_of(rows: Rows) -> NDArray[np.int64]:
+    """(n, 3) in steps of `SCALE_M` from the offset."""
+    return np.column_stack((rows["X"], rows["Y"], rows["Z"])).astype(np.int64)
+
+
+def las_header(projector: Projector, records: Records) -> Any:
+    """Header of laspy: version, scale, offset, coordinate system, kind of time, extra bytes."""
+    import laspy
     from laspy.header import GpsTimeType
     from laspy.vlrs.known import WktCoordinateSystemVlr
 
+    header = laspy.LasHeader(version="1.4", point_format=records.point_format)
     header.scales, header.offsets = np.full(3, SCALE_M), records.offset_m
     header.add_extra_dims(
         [
-            ExtraBytesParams(
-                name, np.dtype(kind), text, offsets=scale and np.zeros(1), scales=scale and np.array([scale])
+            laspy.ExtraBytesParams(
+                name,
+                np.dtype(kind),
+                text,
+                offsets=None if scale is None else np.zeros(1),
+                scales=None if scale is None else np.array([scale]),
             )
             for name, kind, text, scale in EXTRA_BYTES
         ]
@@ -151,18 +169,18 @@ def describe(header: Any, projector: Projector, records: Records) -> None:
     if records.unix_time:
         header.global_encoding.gps_time_type = GpsTimeType.STANDARD
     header.system_identifier, header.generating_software = "Scanloom", "Scanloom"
-    header.creation_date = None
+    header.creation_date = records.last_day
+    return header
 
 
-def _survey(source: MapSource, names: Iterable[str]) -> tuple[float, int | None]:
-    """Highest intensity and earliest stamp of all points, from two columns of each file."""
-    strongest, earliest = 0.0, None
+def _survey(source: MapSource, names: Iterable[str]) -> tuple[float, int, int]:
+    """Highest intensity, earliest and latest stamp of all points, from two columns of each file."""
+    strongest, first, last = 0.0, [], []
     for name in names:
         table = pq.read_table(part_file(source, name), columns=["intensity", "first_ns"])
-        if table.num_rows == 0:
-            continue
-        light = table["intensity"].to_numpy()
-        strongest = max(strongest, float(np.nanmax(light, initial=0.0)))
-        first = int(table["first_ns"].to_numpy().min())
-        earliest = first if earliest is None else min(first, earliest)
-    return strongest, earliest
+        if table.num_rows:
+            strongest = max(strongest, float(np.nanmax(table["intensity"].to_numpy(), initial=0.0)))
+            stamps = table["first_ns"].to_numpy()
+            first.append(int(stamps.min()))
+            last.append(int(stamps.max()))
+    return strongest, min(first, default=0), max(last, default=0)

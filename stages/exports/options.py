@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-ELLIPSOIDAL, ORTHOMETRIC = "ellipsoidal", "orthometric"
+ELLIPSOIDAL: Final = "ellipsoidal"
+ORTHOMETRIC: Final = "orthometric"
 
 
 class Options(BaseModel):
