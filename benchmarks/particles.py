@@ -1,14 +1,17 @@
-"""Particles: how much of the dust and snow in the air denoise names, and what of clear air's scenery it takes for such.
+"""Particles: how much of the dust and snow in the air is named, and what of clear air's scenery is taken for such.
 
-`python -m benchmarks.particles [--data FOLDER] [--store FOLDER] [--beams 32 64] [--seed N] [--seconds S] [--scenes NAME ...] [--json -]`
-makes short simulated drives in snow and dust of three densities and in clear air, and labels them. With `--data`, the folder
-that holds `kitti_raw_0005`, real scans in clear air are labelled, too.
+`python -m benchmarks.particles [--data FOLDER] [--store FOLDER] [--beams 32 64] [--seeds N ...] [--seconds S] [--scenes NAME ...] [--json -]`
+makes simulated drives in snow and dust of three densities and in clear air, and maps each of them by itself, up to the final
+labels. Two sets of labels are judged: those of denoise, from a few scans, and the final ones, from the whole map, with
+estimated poses. Figures are of each drive, and of all seeds together. With `--data`, the folder that holds `kitti_raw_0005`,
+real scans in clear air are labelled, too.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,9 +24,10 @@ from benchmarks.figures import published
 from benchmarks.scores import Figure
 from benchmarks.sequences import Drive, produced
 from scanloom.pipeline.run import Result
+from scanloom.schemas.clean import FinalLabels
 from scanloom.schemas.product import Product
 from scanloom.schemas.rig import SensorCheck
-from scanloom.schemas.scans import Deskewed, DeskewedScan, PointClass, TruePoints
+from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, TruePoints
 from scanloom.schemas.session import Session, TruthLog
 from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.stages.denoise import Settings, denoise
@@ -42,7 +46,15 @@ WORLD = {"start_m": 300.0, "standstill_s": 0.5, "dust_per_m": 0.0}
 VEGETATION = (Material.GRASS, Material.BARK, Material.LEAF)
 KITTI = "kitti_raw_0005"
 AIRBORNE, OUTLIER = int(PointClass.AIRBORNE), int(PointClass.OUTLIER)
+LEAST_SHARE = 1e-4
+"""Of points in the air, below which there is nothing to find."""
 LEFT_OUT = (int(PointClass.EGO), int(PointClass.OUT_OF_RANGE))
+
+
+TIMED = 40
+"""Scans that denoise is timed on."""
+JUDGED: dict[str, type[Labels] | type[FinalLabels]] = {"denoise": Labels, "final": FinalLabels}
+OF_DENOISE = (Session, Imu, Wheel, SensorCheck)
 
 
 def main() -> None:
@@ -50,7 +62,7 @@ def main() -> None:
     figures: list[Figure] = []
     for beams in options.beams:
         for scene in options.scenes:
-            figures += simulated(scene, beams, options.seed, options.seconds, options.store)
+            figures += simulated(scene, beams, options.seeds, options.seconds, options.store)
     if options.data is not None:
         figures += real(options.data, options.store)
     published(figures, options.json)
@@ -63,26 +75,40 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--data", type=Path, help=f"folder that holds {KITTI}")
     parser.add_argument("--store", type=Path, default=Path("build/particles"), help="folder of what is made")
     parser.add_argument("--beams", type=int, nargs="+", default=[32, 64])
-    parser.add_argument("--seed", type=int, default=2, help="of town, sensors, traffic and weather")
-    parser.add_argument("--seconds", type=float, default=10.0, help="length of a drive")
+    parser.add_argument(
+        "--seeds",
+        type=int,
+        nargs="+",
+        default=[2, 3, 5],
+        help="of town, sensors, traffic and weather; none was fitted to",
+    )
+    parser.add_argument("--seconds", type=float, default=20.0, help="length of a drive")
     parser.add_argument("--scenes", nargs="*", choices=SCENES, default=list(SCENES))
     parser.add_argument("--json", default="", help="file, or - for standard output")
     return parser.parse_args()
 
 
-def simulated(scene: str, beams: int, seed: int, seconds: float, store: Path) -> Iterator[Figure]:
-    """Figures of one drive with exact truth."""
-    name = f"{scene}_{beams}_{seed}"
-    seeds = {"seed": seed, "town_seed": seed, "parking_seed": seed}
-    drive = Drive(name, name, {**WORLD, **seeds, "beams": beams, "duration_s": seconds, **SCENES[scene]})
-    result = produced(drive, (Deskewed, Session, Imu, Wheel, SensorCheck, TruthLog), store)
-    scans = _scans(result)
-    classes, ms = labelled(result, scans)
-    truth, material = _truth(result)
-    for row in scores(classes, truth, material):
-        yield Figure(f"bench.particles.{name}.{row[0]}", row[1], row[2], name, row[3])
-    points = int(np.mean([len(scan) for scan in scans]))
-    yield Figure(f"bench.particles.{name}.ms_per_scan", ms, "ms", name, _how(points))
+def simulated(scene: str, beams: int, seeds: list[int], seconds: float, store: Path) -> Iterator[Figure]:
+    """Figures of drives with exact truth, one for each seed, and of all of them."""
+    total: dict[str, Counter[str]] = {labels: Counter() for labels in JUDGED}
+    for seed in seeds:
+        name = f"{scene}_{beams}_{seed}"
+        of_seed = {"seed": seed, "town_seed": seed, "parking_seed": seed}
+        drive = Drive(
+            name, name, {**WORLD, **of_seed, "beams": beams, "duration_s": seconds, **SCENES[scene]}
+        )
+        result = produced(drive, (Deskewed, *OF_DENOISE, TruthLog, Labels, FinalLabels), store)
+        truth, material = _truth(result)
+        for labels, product in JUDGED.items():
+            counts = tally(_classes(result, product), truth, material)
+            total[labels] += counts
+            yield from _figures(f"{name}.{labels}", name, counts)
+        yield _time(result, name, drive.name)
+    if len(seeds) > 1:
+        for labels, counts in total.items():
+            yield from _figures(
+                f"{scene}_{beams}.{labels}", f"{scene}, {beams} beams, {len(seeds)} drives", counts
+            )
 
 
 def real(data: Path, store: Path) -> Iterator[Figure]:
@@ -91,66 +117,106 @@ def real(data: Path, store: Path) -> Iterator[Figure]:
         Console(stderr=True).print(f"{data / KITTI} is not there: no real scans are labelled")
         return
     drive = Drive("kitti_0005", "KITTI raw 0005", folder=data / KITTI)
-    result = produced(drive, (Deskewed, Session, Imu, Wheel, SensorCheck), store)
-    scans = _scans(result)
-    classes, ms = labelled(result, scans)
-    for name, value in (("airborne_share", AIRBORNE), ("outlier_share", OUTLIER)):
-        share = float(np.mean(classes == value))
-        yield Figure(f"bench.particles.kitti_0005.{name}", share, "", drive.name, f"of {len(classes)} points")
-    points = int(np.mean([len(scan) for scan in scans]))
-    yield Figure("bench.particles.kitti_0005.ms_per_scan", ms, "ms", drive.name, _how(points))
+    result = produced(drive, (Deskewed, *OF_DENOISE, Labels, FinalLabels), store)
+    for labels, product in JUDGED.items():
+        classes = _classes(result, product)
+        for name, value in (("airborne_share", AIRBORNE), ("outlier_share", OUTLIER)):
+            share = float(np.mean(classes == value))
+            yield Figure(
+                f"bench.particles.kitti_0005.{labels}.{name}",
+                share,
+                "",
+                drive.name,
+                f"of {len(classes)} points",
+            )
+    yield _time(result, "kitti_0005", drive.name)
 
 
-def labelled(result: Result, scans: list[DeskewedScan]) -> tuple[NDArray[np.uint8], float]:
-    """Classes of all points, and ms of one core per scan without reading; kernels are compiled before."""
-    rest = [_one(result, product) for product in (Session, Imu, Wheel, SensorCheck)]
+def _time(result: Result, name: str, scope: str) -> Figure:
+    """Ms of one core per scan that denoise takes without reading; kernels are compiled before."""
+    scans = [scan for _, scan in zip(range(TIMED), _scans(result))]
+    rest = [_one(result, product) for product in OF_DENOISE]
     for _ in iter(denoise(Settings(), Deskewed(scans[:3]), *rest)):
         pass
     started = time.process_time()
-    classes = [labels.class_ for labels in iter(denoise(Settings(), Deskewed(scans), *rest))]
-    return np.concatenate(classes), 1e3 * (time.process_time() - started) / len(scans)
+    for _ in iter(denoise(Settings(), Deskewed(scans), *rest)):
+        pass
+    ms = 1e3 * (time.process_time() - started) / len(scans)
+    points = int(np.mean([len(scan) for scan in scans]))
+    return Figure(f"bench.particles.{name}.denoise.ms_per_scan", ms, "ms", scope, _how(len(scans), points))
 
 
-Row = tuple[str, float, str, str]
-
-
-def scores(found: NDArray[np.uint8], truth: NDArray[np.uint8], material: NDArray[np.uint8]) -> Iterator[Row]:
-    """Of points that are in range and not the own vehicle."""
+def tally(found: NDArray[np.uint8], truth: NDArray[np.uint8], material: NDArray[np.uint8]) -> Counter[str]:
+    """Numbers of points that are in range and not the own vehicle, by what they are and what they are called."""
     counted = ~np.isin(found, LEFT_OUT) & ~np.isin(truth, LEFT_OUT)
     found, truth, material = found[counted], truth[counted], material[counted]
-    air, named = truth == AIRBORNE, found == AIRBORNE
-    removed = named | (found == OUTLIER)
-    yield "share", float(air.mean()), "", f"of {len(truth)} points are in the air"
-    if air.mean() > 1e-4:
-        precision, recall = _ratio(air & named, named), _ratio(air & named, air)
-        yield "precision", precision, "", "of the points called airborne"
-        yield "recall", recall, "", "of the points in the air, called airborne"
-        yield "f1", 2 * precision * recall / max(precision + recall, 1e-9), "", "of both"
-        yield "removed_recall", _ratio(air & removed, air), "", "of the same, called airborne or outlier"
+    air, named, stray = truth == AIRBORNE, found == AIRBORNE, found == OUTLIER
     true = ~air & (truth != OUTLIER)
-    yield "clean_loss", _ratio(true & removed, true), "", "of the rest that is not stray, airborne or outlier"
-    yield "clean_loss_airborne", _ratio(true & named, true), "", "of the same, called airborne"
-    moving = truth == PointClass.DYNAMIC
-    yield "standing_loss", _ratio(true & ~moving & removed, true & ~moving), "", "of the same, if it stands"
-    leafy = true & np.isin(material, VEGETATION) & (truth == PointClass.STATIC)
-    yield "vegetation_loss", _ratio(leafy & removed, leafy), "", "of trees and bushes, airborne or outlier"
-    yield "vegetation_loss_airborne", _ratio(leafy & named, leafy), "", "of the same, called airborne"
+    sets = {
+        "air": air,
+        "true": true,
+        "standing": true & (truth != PointClass.DYNAMIC),
+        "leafy": true & np.isin(material, VEGETATION) & (truth == PointClass.STATIC),
+    }
+    counts = Counter(all=len(truth), named=int(named.sum()))
+    for name, one in sets.items():
+        counts[name] = int(one.sum())
+        counts[f"{name} named"], counts[f"{name} stray"] = int((one & named).sum()), int((one & stray).sum())
+    return counts
 
 
-def _ratio(some: NDArray[np.bool_], of: NDArray[np.bool_]) -> float:
-    return float(some.sum() / max(of.sum(), 1))
+def _figures(name: str, scope: str, counts: Counter[str]) -> Iterator[Figure]:
+    for figure, value, method in scores(counts):
+        yield Figure(f"bench.particles.{name}.{figure}", value, "", scope, method)
 
 
-def _how(points: int) -> str:
-    return f"mean of all scans, {points} points each, one core, no files; ground and moving things included"
+def scores(counts: Counter[str]) -> Iterator[tuple[str, float, str]]:
+    """Name, value and method of each figure."""
+    share = _ratio(counts["air"], counts["all"])
+    yield "share", share, f"of {counts['all']} points are in the air"
+    if share > LEAST_SHARE:
+        precision = _ratio(counts["air named"], counts["named"])
+        recall = _ratio(counts["air named"], counts["air"])
+        yield "precision", precision, "of the points called airborne"
+        yield "recall", recall, "of the points in the air, called airborne"
+        yield "f1", 2 * precision * recall / max(precision + recall, 1e-9), "of both"
+        yield "removed_recall", _removed("air", counts), "of the same, called airborne or outlier"
+    yield "clean_loss", _removed("true", counts), "of the rest that is not stray, airborne or outlier"
+    yield "clean_loss_airborne", _ratio(counts["true named"], counts["true"]), "of the same, called airborne"
+    yield "standing_loss", _removed("standing", counts), "of the same, if it stands, airborne or outlier"
+    yield "vegetation_loss", _removed("leafy", counts), "of trees and bushes, airborne or outlier"
+    yield (
+        "vegetation_loss_airborne",
+        _ratio(counts["leafy named"], counts["leafy"]),
+        "of the same, called airborne",
+    )
+
+
+def _removed(what: str, counts: Counter[str]) -> float:
+    return _ratio(counts[f"{what} named"] + counts[f"{what} stray"], counts[what])
+
+
+def _ratio(some: int, of: int) -> float:
+    return some / max(of, 1)
+
+
+def _how(scans: int, points: int) -> str:
+    return (
+        f"mean of {scans} scans, {points} points each, one core, no files; ground and moving things included"
+    )
 
 
 def _one(result: Result, product: type[Product]) -> Any:
     return result.parts(product)[0]
 
 
-def _scans(result: Result) -> list[DeskewedScan]:
-    return [scan for chunk in result.parts(Deskewed) for scan in chunk]
+def _scans(result: Result) -> Iterator[DeskewedScan]:
+    return (scan for chunk in result.parts(Deskewed) for scan in chunk)
+
+
+def _classes(result: Result, product: type[Labels] | type[FinalLabels]) -> NDArray[np.uint8]:
+    """Classes of all points, in the order of chunks and scans."""
+    return np.concatenate([labels.class_ for chunk in result.parts(product) for labels in chunk])
 
 
 def _truth(result: Result) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
