@@ -77,6 +77,10 @@ class Canvas:
             block["lowest"][at] = np.minimum(block["lowest"][at], lowest[run])
             block["highest"][at] = np.maximum(block["highest"][at], highest[run])
 
+    def holds(self, row: int, column: int, rows: int, columns: int) -> bool:
+        """Whether anything may be painted there; False is certain and costs nothing."""
+        return any(True for _ in self._among(row, column, rows, columns))
+
     def highest_at(self, xy: F8) -> NDArray[np.float32]:
         """The highest value (n,) of the cells around places (n, 2); minus infinity where there is none."""
         found = np.full(len(xy), -np.inf, np.float32)
@@ -93,16 +97,13 @@ class Canvas:
     def window(self, row: int, column: int, rows: int, columns: int) -> NDArray[np.void]:
         """Cells (rows, columns) from a first row and column on, row by row northwards; copied."""
         out = blank((rows, columns))
-        for r in range(row // BLOCK, (row + rows - 1) // BLOCK + 1):
-            for c in range(column // BLOCK, (column + columns - 1) // BLOCK + 1):
-                if (r, c) not in self._blocks and (r, c) not in self._spilled:
-                    continue
-                top, left = max(row, r * BLOCK), max(column, c * BLOCK)
-                bottom, right = min(row + rows, (r + 1) * BLOCK), min(column + columns, (c + 1) * BLOCK)
-                part = self._block((r, c))[
-                    top - r * BLOCK : bottom - r * BLOCK, left - c * BLOCK : right - c * BLOCK
-                ]
-                out[top - row : bottom - row, left - column : right - column] = part
+        for r, c in self._among(row, column, rows, columns):
+            top, left = max(row, r * BLOCK), max(column, c * BLOCK)
+            bottom, right = min(row + rows, (r + 1) * BLOCK), min(column + columns, (c + 1) * BLOCK)
+            part = self._block((r, c))[
+                top - r * BLOCK : bottom - r * BLOCK, left - c * BLOCK : right - c * BLOCK
+            ]
+            out[top - row : bottom - row, left - column : right - column] = part
         return out
 
     def _runs(self, keys: I8, first: I8) -> Iterator[tuple[NDArray[np.void], I8, slice]]:
@@ -112,6 +113,13 @@ class Canvas:
             row, column = divmod(int(keys[begin]) // BLOCK**2, ACROSS)
             block = self._block((int(first[0]) + row, int(first[1]) + column))
             yield block.reshape(-1), keys[begin:end] % BLOCK**2, slice(int(begin), int(end))
+
+    def _among(self, row: int, column: int, rows: int, columns: int) -> Iterator[tuple[int, int]]:
+        """Blocks that were ever touched and reach into a window."""
+        for r in range(row // BLOCK, (row + rows - 1) // BLOCK + 1):
+            for c in range(column // BLOCK, (column + columns - 1) // BLOCK + 1):
+                if (r, c) in self._blocks or (r, c) in self._spilled:
+                    yield r, c
 
     def _grow(self, cells: I8) -> None:
         low, high = cells.min(axis=1), cells.max(axis=1)
@@ -134,7 +142,7 @@ class Canvas:
         return self.folder / f"block_{key[0]}_{key[1]}.npy"
 
 
-def blank(shape: tuple[int, int]) -> NDArray[np.void]:
+def blank(shape: tuple[int, ...]) -> NDArray[np.void]:
     """Cells that hold nothing."""
     cells = np.zeros(shape, CELL)
     cells["lowest"], cells["highest"] = np.inf, -np.inf

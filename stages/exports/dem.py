@@ -48,9 +48,9 @@ def write_dem(source: MapSource, folder: Path, options: Options) -> list[Path]:
 def _heights(canvas: Canvas, lattice: Lattice, window: Window, reach: int) -> list[NDArray[Any]] | None:
     """Mean, lowest and count of a window of the file."""
     cells = cells_in(canvas, lattice, window, reach)
-    known = cells["count"] > 0
-    if not known.any():
+    if cells is None:
         return None
+    known = cells["count"] > 0
     filled = [fill_holes(values, known, reach) for values in (mean_of(cells), cells["lowest"])]
     inner = slice(reach, -reach or None)
     counts = cells["count"][inner, inner]

@@ -112,13 +112,13 @@ def _write_drafts(
 
 def _draft(path: Path, lattice: Lattice, layer: Layer) -> Any:
     import rasterio
-    from rasterio.transform import from_origin
+    from affine import Affine
 
     cell = lattice.cell
     file = rasterio.open(
         path, "w", driver="GTiff", width=lattice.columns, height=lattice.rows, count=1, dtype=layer.dtype,
         nodata=layer.nodata, crs=lattice.crs, tiled=True, blockxsize=TILE, blockysize=TILE, SPARSE_OK=True,
-        BIGTIFF="IF_SAFER", transform=from_origin(lattice.west * cell, lattice.north * cell, cell, cell),
+        BIGTIFF="IF_SAFER", transform=Affine(cell, 0.0, lattice.west * cell, 0.0, -cell, lattice.north * cell),
     )  # fmt: skip
     file.set_band_description(1, layer.doc)
     file.set_band_unit(1, layer.unit)

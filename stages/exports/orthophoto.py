@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.schemas.scans import PointClass
-from scanloom.stages.exports.canvas import Canvas
+from scanloom.stages.exports.canvas import Canvas, blank
 from scanloom.stages.exports.geotiff import Layer, Window, write_geotiffs
 from scanloom.stages.exports.options import Options
 from scanloom.stages.exports.raster import Ground, cells_in, mean_of
@@ -47,15 +47,16 @@ def write_orthophoto(source: MapSource, folder: Path, options: Options) -> list[
             intensity = tile.intensity.astype(np.float64)
             seen = points[:, 2] > heights.highest_at(points[:, :2]) - TOP_M
             top.paint(points[seen, :2], intensity[seen])
-            low_lying = tile.class_ == PointClass.GROUND
-            road.paint(points[low_lying, :2], intensity[low_lying])
+            on_ground = tile.class_ == PointClass.GROUND
+            road.paint(points[on_ground, :2], intensity[on_ground])
         scale = (high - low) / (NUMBERS - 1) or 1.0
 
         def numbers(window: Window) -> list[NDArray[Any]] | None:
-            cells = [cells_in(canvas, lattice, window) for canvas in (top, road)]
-            if not any(part["count"].any() for part in cells):
+            if (seen := cells_in(top, lattice, window)) is None:
                 return None
-            return [_numbers(part, low, scale)[::-1] for part in cells]
+            ground_cells = cells_in(road, lattice, window)
+            low_lying = blank(seen.shape) if ground_cells is None else ground_cells
+            return [_numbers(part, low, scale)[::-1] for part in (seen, low_lying)]
 
         return write_geotiffs(folder, lattice, _layers(scale, low - scale), numbers)
 

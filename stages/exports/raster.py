@@ -75,13 +75,12 @@ class Ground:
         return Lattice(canvas.cell, column, row + rows, rows, columns, None if crs is None else crs.to_wkt())
 
 
-def cells_in(canvas: Canvas, lattice: Lattice, window: Window, margin: int = 0) -> NDArray[np.void]:
-    """Cells of a window of the file and of a margin around it, rows northwards."""
+def cells_in(canvas: Canvas, lattice: Lattice, window: Window, margin: int = 0) -> NDArray[np.void] | None:
+    """Cells of a window of the file and of a margin around it, rows northwards; None where nothing is near."""
     row, column, rows, columns = window
     south = lattice.north - row - rows
-    return canvas.window(
-        south - margin, lattice.west + column - margin, rows + 2 * margin, columns + 2 * margin
-    )
+    wide = (south - margin, lattice.west + column - margin, rows + 2 * margin, columns + 2 * margin)
+    return canvas.window(*wide) if canvas.holds(*wide) else None
 
 
 def mean_of(cells: NDArray[np.void]) -> NDArray[np.float32]:

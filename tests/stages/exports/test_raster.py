@@ -219,3 +219,30 @@ def test_one_point(tmp_path: Path) -> None:
         want = world_to_projected(MUNICH, [[-3.3, 4.4, 1.5]])[0]
         assert raster.read(1)[0, 0] == pytest.approx(want[2], abs=1e-4)
         assert 0.0 <= want[0] - raster.bounds.left < CELL and 0.0 <= want[1] - raster.bounds.bottom < CELL
+
+
+def test_far_apart_places_leave_the_file_small(tmp_path: Path) -> None:
+    near = plane(4000, size_m=20.0, slope=SLOPE)
+    far = near + np.array([900.0, 700.0, 900.0 * SLOPE[0] + 700.0 * SLOPE[1]])
+    source = delivered(tmp_path / "m", MUNICH, {}, np.vstack((near, far)))
+    mean, _, count = write_dem(source, tmp_path, Options())
+    with rasterio.open(mean) as raster, rasterio.open(count) as counts:
+        assert raster.width > 3500 and raster.height > 2800
+        assert counts.read(1).sum() == 8000
+        assert mean.stat().st_size < 0.01 * 4 * raster.width * raster.height
+        places = world_to_projected(MUNICH, [[0.5, 0.5, 0.1], [900.5, 700.5, 240.1], [450.0, 350.0, 0.0]])
+        first, second, between = (float(v[0]) for v in raster.sample(places[:, :2]))
+    assert first == pytest.approx(places[0, 2], abs=0.2)
+    assert second == pytest.approx(places[1, 2], abs=0.2)
+    assert between == -9999.0
+
+
+@pytest.mark.parametrize("cell", [0.1, 0.3, 1.0])
+def test_cells_of_any_size_count_the_same_points(tmp_path: Path, cell: float) -> None:
+    points = clear_of_edges(plane(3000, size_m=20.0), CAPE_TOWN, cell)
+    _, _, count = write_dem(delivered(tmp_path / "m", CAPE_TOWN, {}, points), tmp_path, Options(cell_m=cell))
+    with rasterio.open(count) as raster:
+        assert raster.res == pytest.approx((cell, cell))
+        np.testing.assert_array_equal(
+            raster.read(1), histogram(raster, world_to_projected(CAPE_TOWN, points))
+        )
