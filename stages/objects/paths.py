@@ -25,7 +25,9 @@ B1 = NDArray[np.bool_]
 SEEN = kalman.STATE
 FULL_TURN = 2.0 * np.pi
 HEADING_M_S = 1.0
-REST_M = 0.5
+REST_M, REST_SHARE, MOST_REST_M = 0.5, 0.2, 1.0
+"""What rests seems to wander by the first, or by that share of its length up to the last: of a vehicle a few points show now
+one end, now the other."""
 MANY_SCANS = 15
 UPRIGHT_M = 0.4
 """Things stand upright: rings of the sensor on the ground, which run along with the vehicle, do not."""
@@ -89,7 +91,7 @@ def object_path(settings: Settings, history: History, scan_index: NDArray[np.int
         yaw=yaw,
         size=size,
         speed_m_s=speed,
-        dynamic=dynamic_rows(settings, t, path),
+        dynamic=dynamic_rows(settings, t, path, _rest_m(size)),
         kind=_kind(size, speed),
         score=score,
     )
@@ -232,11 +234,16 @@ def _yaw(seen: F8, place: NDArray[np.int64], path: F8, speed: F8, size: F8) -> F
     return yaw if forward >= 0.0 else yaw + np.pi
 
 
-def dynamic_rows(settings: Settings, t: F8, path: F8) -> B1:
-    """All rows but those after it came to rest for good: where a path (n, 2 or more) of times t, s, stays to its end."""
+def _rest_m(size: F8) -> float:
+    return min(max(REST_M, REST_SHARE * float(size[:2].max())), MOST_REST_M)
+
+
+def dynamic_rows(settings: Settings, t: F8, path: F8, rest_m: float = REST_M) -> B1:
+    """All rows but those after it came to rest for good: where a path (n, 2 or more) of times t, s, stays within `rest_m`
+    to its end."""
     rest = np.median(path[t >= t[-1] - settings.parked_s, :2], axis=0)
     apart = np.hypot(*(path[:, :2] - rest).T)
-    last = int(np.flatnonzero(apart > REST_M).max(initial=0))
+    last = int(np.flatnonzero(apart > rest_m).max(initial=0))
     moving = np.ones(len(t), bool)
     if t[-1] - t[last] > settings.parked_s:
         moving[last + 1 :] = False

@@ -104,6 +104,16 @@ def test_it_has_parked_even_if_its_last_place_is_off(stands_s: float, parked: bo
     assert dynamic[t > 4.1].any() != parked
 
 
+@pytest.mark.parametrize(("rest_m", "parked"), [(0.69, False), (0.71, True)])
+def test_what_wanders_by_less_than_its_length_explains_has_parked(rest_m: float, parked: bool) -> None:
+    t = np.arange(0.0, 13.0, 0.1)
+    x = 3.0 * np.minimum(t, 4.0)
+    x[-8:] += 0.7
+    dynamic = dynamic_rows(Settings(), t, np.column_stack((x, np.zeros(len(t)))), rest_m)
+    assert dynamic[t < 3.7].all()
+    assert dynamic[t > 4.3].any() != parked
+
+
 @pytest.mark.parametrize("side_m", [3.2, 4.5])
 def test_a_bus_that_halts_while_we_pass_and_drives_on_is_covered_all_the_time(side_m: float) -> None:
     def boxes(t: float) -> list[list[list[float]]]:
