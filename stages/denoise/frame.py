@@ -20,6 +20,7 @@ I8 = NDArray[np.int64]
 
 BESIDE = 4
 """Columns that are repeated at either end."""
+FIRST = np.int32(0)
 NO_RANGE = np.float32(np.nan)
 """Of the rows above and below: any comparison with it fails."""
 
@@ -74,11 +75,13 @@ def _framed(range_m: F4, point: I4) -> tuple[F4, I4]:
 @kernel
 def _places(cell: I4, x: F4, y: F4, z: F4, columns: int) -> tuple[I4, F4]:
     place, away = np.empty(len(cell), np.int32), np.empty(len(cell), np.float32)
-    wide, beside = np.int32(columns), np.int32(2 * BESIDE)
-    first = np.int32(columns + 3 * BESIDE)
+    per_column, beside, first = 1.0 / columns, np.int32(2 * BESIDE), np.int32(columns + 3 * BESIDE)
     for n in range(len(cell)):
         k = cell[n]
-        place[n] = k + (k // wide) * beside + first if k >= 0 else -1
+        row = np.int32(
+            (k + 0.5) * per_column
+        )  # quicker than to divide whole numbers, and exact for fewer than 2^31
+        place[n] = k + row * beside + first if k >= 0 else np.int32(-1)
         away[n] = np.sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n])
     return place, away
 
@@ -99,7 +102,8 @@ def places_from(x: F4, y: F4, z: F4, T: F4, row_start: I4, columns: int) -> tupl
         )
         level = np.sqrt(px * px + py * py)
         away[n] = np.sqrt(level * level + pz * pz)
-        row[n], column[n] = elevation_bin(level, pz), min(np.int32(turn_of(px, py) * width), last)
+        row[n] = max(np.int32(elevation_bin(level, pz)), FIRST)  # also of what is not finite
+        column[n] = max(min(np.int32(turn_of(px, py) * width), last), FIRST)
     for n in range(len(x)):
         column[n] += row_start[row[n]]
     return column, away

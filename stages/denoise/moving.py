@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.schemas.scans import DeskewedScan, PointClass
+from scanloom.stages.denoise.frame import places_from
 from scanloom.stages.denoise.window import Moment, Neighbour, View
 from scanloom.stages.geometry.kernels import kernel
-from scanloom.stages.geometry.range_image import RangeImage, elevation_bin, turn_of
-from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.range_image import RangeImage
 from scanloom.stages.geometry.segments import alike, connected
 from scanloom.stages.geometry.voxels import Int
 
@@ -72,11 +72,8 @@ class Movers:
         moves = _judged(view, thin, thing, count, votes)
         if not moves.any():
             return out
-        scan, image = view.scan, view.image
-        marked: B1 = _spread(
-            scan.x_m, scan.y_m, scan.z_m, classes, image.point, image.range_m, image.row_of_bin,
-            thin.range_m, thin.stride, thing, moves,
-        )  # fmt: skip
+        gate_m = _gates(view.image.point.shape[1], thin.range_m, thin.stride, thing, moves)
+        marked: B1 = _spread(view.image.cell, view.frame.away_m, classes, gate_m)
         return marked
 
     def _votes(self, moment: Moment, thin: _Thin) -> _Votes:
@@ -97,10 +94,12 @@ class Movers:
         if T is None:
             return
         margin_m = MARGIN_M + MARGIN_PER_TRAVEL * float(np.linalg.norm(T[:3, 3]))
-        _look(
-            scan.x_m, scan.y_m, scan.z_m, thin.point, np.ascontiguousarray(T), screen.image.range_m,
-            screen.nearest_m, screen.image.row_of_bin, margin_m, again, count, near, told,
-        )  # fmt: skip
+        cell, x, y, z = _listed(scan.x_m, scan.y_m, scan.z_m, thin.point, count, again)
+        image, columns = screen.image, screen.image.point.shape[1]
+        place, away_m = places_from(
+            x, y, z, T.astype(np.float32), image.row_of_bin * np.int32(columns), columns
+        )
+        _look(cell, place, away_m, image.range_m, screen.nearest_m, margin_m, again, count, near, told)
 
     def _screen(self, view: View) -> _Screen:
         index = view.scan.scan_index
@@ -189,24 +188,32 @@ def _judged(view: View, thin: _Thin, thing: I4, count: Int, votes: _Votes) -> B1
 def _nearest(point: I4, range_m: F4, classes: U1, half: int) -> F4:
     """Within `half` columns and one row of each cell."""
     rows, columns = point.shape
-    along = np.full((rows, columns), np.inf, np.float32)
+    along = np.empty((rows, columns), np.float32)
+    wide = np.empty(columns + 2 * half, np.float32)  # the row, continued round the seam
     for v in range(rows):
         for u in range(columns):
             p = point[v, u]
-            if p < 0 or classes[p] == GROUND:
-                continue
-            r = range_m[v, u]
-            for d in range(u - half, u + half + 1):
-                w = d + columns if d < 0 else (d - columns if d >= columns else d)
-                along[v, w] = min(along[v, w], r)
+            wide[half + u] = range_m[v, u] if p >= 0 and classes[p] != GROUND else np.float32(np.inf)
+        for k in range(half):
+            wide[k], wide[half + columns + k] = wide[columns + k], wide[half + k]
+        row = along[v]
+        row[:] = wide[:columns]
+        for d in range(1, 2 * half + 1):
+            _lower(row, wide[d : d + columns])
     out = along.copy()
     for v in range(rows):
-        for u in range(columns):
-            if v > 0:
-                out[v, u] = min(out[v, u], along[v - 1, u])
-            if v + 1 < rows:
-                out[v, u] = min(out[v, u], along[v + 1, u])
+        if v > 0:
+            _lower(out[v], along[v - 1])
+        if v + 1 < rows:
+            _lower(out[v], along[v + 1])
     return out
+
+
+@kernel
+def _lower(one: F4, other: F4) -> None:
+    """The lesser of both into the first."""
+    for u in range(len(one)):
+        one[u] = other[u] if other[u] < one[u] else one[u]
 
 
 @kernel
@@ -216,43 +223,47 @@ def _thin(point: I4, range_m: F4, classes: U1, stride: int) -> tuple[I4, F4]:
     out = np.full((rows, (columns + stride - 1) // stride), -1, np.int32)
     ranges = np.zeros(out.shape, np.float32)
     for v in range(rows):
-        for u in range(columns):
-            p, w = point[v, u], u // stride
-            if p >= 0 and classes[p] == STATIC and (out[v, w] < 0 or range_m[v, u] < ranges[v, w]):
-                out[v, w], ranges[v, w] = p, range_m[v, u]
+        for w in range(out.shape[1]):
+            for u in range(w * stride, min(w * stride + stride, columns)):
+                p = point[v, u]
+                if p >= 0 and classes[p] == STATIC and (out[v, w] < 0 or range_m[v, u] < ranges[v, w]):
+                    out[v, w], ranges[v, w] = p, range_m[v, u]
     return out, ranges
 
 
 @kernel
+def _listed(x: F4, y: F4, z: F4, point: I4, counts: NDArray[np.int8], again: bool) -> tuple[I4, F4, F4, F4]:
+    """Cells (m,) that are looked at, those where it was free if `again`, and the coordinates of their points."""
+    cell, points, free = np.empty(point.size + 1, np.int32), point.ravel(), counts.ravel()
+    found = 0
+    for k in range(len(points)):
+        cell[found] = k
+        found += int((points[k] >= 0) & ((not again) | (free[k] > 0)))
+    a, b, c = np.empty(found, np.float32), np.empty(found, np.float32), np.empty(found, np.float32)
+    for m in range(found):
+        i = points[cell[m]]
+        a[m], b[m], c[m] = x[i], y[i], z[i]
+    return cell[:found].copy(), a, b, c
+
+
+@kernel
 def _look(
-    x: F4, y: F4, z: F4, point: I4, T: F8, range_m: F4, nearest_m: F4, row_of_bin: I4, margin_m: float, again: bool,
-    free: NDArray[np.int8], near: B1, told: B1,
+    cell: I4, place: I4, away: F4, range_m: F4, nearest_m: F4, margin_m: float, again: bool,
+    counts: NDArray[np.int8], nears: B1, tolds: B1,
 ) -> None:  # fmt: skip
-    """Notes, in place, where the neighbour sees through, sees something near, or either; `again` looks only where it was free."""
-    rows, columns = point.shape
-    R = T.astype(np.float32)
-    width = np.float32(range_m.shape[1])
+    """Notes, in place, where the neighbour sees through, sees something near, or either."""
     base, per_m = np.float32(margin_m), np.float32(MARGIN_PER_M)
-    for v in range(rows):
-        for u in range(columns):
-            i = point[v, u]
-            if i < 0 or (again and free[v, u] == 0):
-                continue
-            px = R[0, 0] * x[i] + R[0, 1] * y[i] + R[0, 2] * z[i] + R[0, 3]
-            py = R[1, 0] * x[i] + R[1, 1] * y[i] + R[1, 2] * z[i] + R[1, 3]
-            pz = R[2, 0] * x[i] + R[2, 1] * y[i] + R[2, 2] * z[i] + R[2, 3]
-            square = px * px + py * py
-            r = np.sqrt(square + pz * pz)
-            row = row_of_bin[elevation_bin(np.sqrt(square), pz)]
-            column = min(int(turn_of(px, py) * width), range_m.shape[1] - 1)
-            margin = base + per_m * r
-            around, behind = nearest_m[row, column], range_m[row, column]
-            if around < r + margin:
-                if around > r - margin and not again:
-                    near[v, u] = told[v, u] = True
-            elif behind > r + margin:
-                told[v, u] = True
-                free[v, u] += 1
+    free, near, told = counts.ravel(), nears.ravel(), tolds.ravel()
+    first, behind = nearest_m.ravel(), range_m.ravel()
+    for m in range(len(cell)):
+        k, at, r = cell[m], place[m], away[m]
+        margin = base + per_m * r
+        if first[at] < r + margin:
+            if first[at] > r - margin and not again:
+                near[k] = told[k] = True
+        elif behind[at] > r + margin:
+            told[k] = True
+            free[k] += 1
 
 
 @kernel
@@ -279,26 +290,22 @@ def _counted(
 
 
 @kernel
-def _spread(
-    x: F4, y: F4, z: F4, classes: U1, point: I4, range_m: F4, row_of_bin: I4, thin_m: F4, stride: int, thing: I4,
-    moves: B1,
-) -> B1:  # fmt: skip
-    """The STATIC points (n,) in whose cell lies a moving thing about as far away."""
-    out, drawn = np.zeros(len(x), np.bool_), np.zeros(len(x), np.bool_)
-    rows, columns = point.shape
+def _gates(columns: int, thin_m: F4, stride: int, thing: I4, moves: B1) -> F4:
+    """(rows, columns) range of the moving thing in each cell; -inf where there is none, which nothing is like."""
+    rows, fewer = thin_m.shape
+    out = np.full((rows, columns), -np.inf, np.float32)
     for v in range(rows):
-        for u in range(columns):
-            i, w = point[v, u], u // stride
-            if i >= 0:
-                drawn[i] = True
-                if classes[i] == STATIC and thing[v, w] >= 0 and moves[thing[v, w]]:
-                    out[i] = alike(range_m[v, u], thin_m[v, w])
-    for i in range(len(x)):
-        if drawn[i] or classes[i] != STATIC:
-            continue
-        level = np.sqrt(x[i] * x[i] + y[i] * y[i])
-        v = row_of_bin[elevation_bin(level, z[i])]
-        w = min(int(turn_of(x[i], y[i]) * np.float32(columns)), columns - 1) // stride
-        if thing[v, w] >= 0 and moves[thing[v, w]]:
-            out[i] = alike(np.sqrt(level * level + z[i] * z[i]), thin_m[v, w])
+        for w in range(fewer):
+            if thing[v, w] >= 0 and moves[thing[v, w]]:
+                out[v, w * stride : min(w * stride + stride, columns)] = thin_m[v, w]
+    return out
+
+
+@kernel
+def _spread(cell: I4, away: F4, classes: U1, gate_m: F4) -> B1:
+    """The STATIC points (n,) in whose cell lies a moving thing about as far away."""
+    out, gates = np.zeros(len(cell), np.bool_), gate_m.ravel()
+    for i in range(len(cell)):
+        if cell[i] >= 0 and classes[i] == STATIC:
+            out[i] = alike(away[i], gates[cell[i]])
     return out

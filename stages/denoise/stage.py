@@ -35,6 +35,8 @@ VERSION = 2
 U1 = NDArray[np.uint8]
 
 REACH = 8
+NEAR_REACH, FAR_REACH = 1.0, 1.5
+"""Half of the edge of the box of an isolated point, over the radius that is set: neighbours in its corners count, too."""
 IMAGE = ImageSettings(rows=128, columns=2048)
 
 
@@ -71,24 +73,19 @@ def _labelled(settings: Settings, around: Iterator[Moment]) -> Iterator[ScanLabe
 
 
 def view(settings: Settings, scan: DeskewedScan, T_base_lidar: F8, beams: int) -> View:
-    """What the scan alone tells: classes and range image."""
-    classes = classify(settings, scan, T_base_lidar, beams)
-    seen = (classes != PointClass.EGO) & (classes != PointClass.OUT_OF_RANGE)
-    return View(scan, classes, range_image(IMAGE, scan.x_m, scan.y_m, scan.z_m, seen, seen))
-
-
-def classify(settings: Settings, scan: DeskewedScan, T_base_lidar: F8, beams: int) -> U1:
-    """Classes (n,) of the points of one scan by itself; `beams` of the sensor, 0 when unknown."""
+    """What the scan alone tells: classes and range image; `beams` of the sensor, 0 when unknown."""
     x, y, z = scan.x_m, scan.y_m, scan.z_m
     classes = bounded(
         x, y, z, T_base_lidar, np.array(settings.ego_low_m), np.array(settings.ego_high_m),
         settings.min_range_m, settings.max_range_m,
     )  # fmt: skip
+    seen = classes == PointClass.STATIC
+    image = range_image(IMAGE, x, y, z, seen, seen)
     if settings.outlier_neighbours > 0:
         lonely = isolated(
-            x, y, z, classes == PointClass.STATIC,
-            radius_m=settings.outlier_radius_m,
-            radius_rad=settings.outlier_steps * azimuth_step_rad(len(scan), beams),
+            image, x, y, z,
+            reach_m=NEAR_REACH * settings.outlier_radius_m,
+            reach_rad=FAR_REACH * settings.outlier_steps * azimuth_step_rad(len(scan), beams),
             least_neighbours=settings.outlier_neighbours,
         )  # fmt: skip
         classes[lonely] = PointClass.OUTLIER
@@ -96,4 +93,9 @@ def classify(settings: Settings, scan: DeskewedScan, T_base_lidar: F8, beams: in
         x, y, z, classes == PointClass.STATIC, T_base_lidar[:3, :3], settings.ground_height_m
     )
     classes[ground] = PointClass.GROUND
-    return classes
+    return View(scan, classes, image)
+
+
+def classify(settings: Settings, scan: DeskewedScan, T_base_lidar: F8, beams: int) -> U1:
+    """Classes (n,) of the points of one scan by itself; `beams` of the sensor, 0 when unknown."""
+    return view(settings, scan, T_base_lidar, beams).classes

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scanloom.schemas.scans import DeskewedScan, Scan
 from scanloom.stages.denoise.frame import Frame
 from scanloom.stages.geometry.motion import MotionTrack
-from scanloom.stages.geometry.neighbours import ThinScan, twist_between
+from scanloom.stages.geometry.neighbours import TARGET_POINTS, ThinScan, twist_between
 from scanloom.stages.geometry.range_image import RangeImage
 from scanloom.stages.geometry.se3 import F8, inverse, se3_exp
 
@@ -145,7 +145,8 @@ class _Steps:
 
 def _standing(scan: DeskewedScan) -> Scan:
     """The scan as one whose points all were measured at its reference time, as deskewing made it."""
-    used = np.flatnonzero(np.isfinite(scan.x_m) & np.isfinite(scan.y_m) & np.isfinite(scan.z_m))
+    used = np.flatnonzero(np.isfinite(scan.x_m + scan.y_m + scan.z_m))
+    used = used[:: max(1, len(used) // TARGET_POINTS) | 1]  # no more are looked at
     return Scan(
         stamp_ns=np.full(len(used), scan.reference_ns, np.int64),
         x_m=scan.x_m[used], y_m=scan.y_m[used], z_m=scan.z_m[used], intensity=scan.intensity[used],

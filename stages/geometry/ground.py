@@ -193,8 +193,10 @@ def _without_strangers(height: F8, highest: F8) -> F8:
             upright = highest[s, b] - height[s, b] >= FLAT_M
             around, lower, flat, below = 0, 0, 0, 0
             for ds in range(-2, 3):
+                t = s + ds
+                t = t + SECTORS if t < 0 else (t - SECTORS if t >= SECTORS else t)
                 for db in range(-2, 3):
-                    t, c = (s + ds) % SECTORS, min(max(b + db, 0), BINS - 1)
+                    c = min(max(b + db, 0), BINS - 1)
                     other = height[t, c]
                     if np.isfinite(other):
                         around += 1

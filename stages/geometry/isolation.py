@@ -1,7 +1,8 @@
 """Points that stand alone: fewer neighbours than a solid surface would give at their range.
 
-The radius in which neighbours are counted grows with the range as the spacing of the beams does (the idea of dynamic
-radius outlier removal, Charron et al. 2018), here with voxels of a few sizes instead of a search tree.
+The reach in which neighbours are counted grows with the range as the spacing of the beams does (the idea of dynamic
+radius outlier removal, Charron et al. 2018). Most points have them right before and after themselves in the order they
+were measured in; for the rest the range image is looked through, in a box along their ray, instead of a search tree.
 """
 
 from __future__ import annotations
@@ -10,139 +11,97 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.stages.geometry.kernels import kernel
-from scanloom.stages.geometry.voxels import EMPTY, Int, find_slot, table_length
+from scanloom.stages.geometry.range_image import RangeImage
+from scanloom.stages.geometry.voxels import Float, Int
 
 F4 = NDArray[np.float32]
 B1 = NDArray[np.bool_]
 I4 = NDArray[np.int32]
-I8 = NDArray[np.int64]
 
-EDGE_SHARE = 0.7
-"""Edge of a voxel over the radius; a point sees its own voxel and the 26 around, so between 0.7 and 1.4 radii."""
 ALONGSIDE = 3
-"""Points before and after a point, in their order, that are looked at before the voxels around it."""
-INDEX_BITS = 19
-INDEX_OFFSET = 1 << (INDEX_BITS - 1)
+"""Points before and after a point, in their order, that are looked at before the image."""
+
+FARTHEST_ROWS, FARTHEST_COLUMNS = 16, 64
+"""Of the image around a point, looked through at most."""
 
 
 def isolated(
-    x_m: F4, y_m: F4, z_m: F4, usable: B1, *, radius_m: float, radius_rad: float, least_neighbours: int
+    image: RangeImage, x_m: F4, y_m: F4, z_m: F4, *, reach_m: float, reach_rad: float, least_neighbours: int
 ) -> B1:
-    """Which usable points (n,) have fewer than `least_neighbours` others around them.
+    """Which points (n,) of an image have fewer than `least_neighbours` others around them; points not drawn never do.
 
     Parameters
     ----------
+    image : of these points.
     x_m, y_m, z_m : (n,) coordinates in the LiDAR frame, m.
-    usable : (n,) points that count as neighbours; the others are never isolated.
-    radius_m : radius close to the sensor.
-    radius_rad : radius over range, from where that is more than `radius_m`.
+    reach_m : half of the edge of the box in which neighbours count, close to the sensor.
+    reach_rad : the same over range, from where that is more than `reach_m`.
     """
-    per_m = radius_rad / radius_m
-    keys = np.full(table_length(len(x_m)), EMPTY, np.int64)
-    counts = np.zeros(len(keys), np.int32)
-    level, slot = _fill(x_m, y_m, z_m, usable, radius_m * EDGE_SHARE, per_m, keys, counts)
-    return _lonely(x_m, y_m, z_m, level, slot, radius_m * EDGE_SHARE, per_m, keys, counts, least_neighbours)
+    row_rad = float(np.median(np.diff(image.elevation_rad))) if len(image.elevation_rad) > 1 else np.pi
+    few = _few_alongside(
+        image.cell, x_m, y_m, z_m, np.float32(reach_m), np.float32(reach_rad), least_neighbours
+    )
+    return _lonely(
+        few, image.cell, x_m, y_m, z_m, image.range_m, row_rad, image.column_rad, reach_m, reach_rad, least_neighbours
+    )  # fmt: skip
 
 
 @kernel
-def _level(ratio: float) -> int:
-    """Smallest level with 2^level >= ratio."""
-    level = 0
-    while ratio > 1.0 and level < 15:
-        ratio *= 0.5
-        level += 1
-    return level
-
-
-@kernel
-def _key(level: int, i: int, j: int, k: int) -> int:
-    key = (level << INDEX_BITS) | ((i + INDEX_OFFSET) & ((1 << INDEX_BITS) - 1))
-    key = (key << INDEX_BITS) | ((j + INDEX_OFFSET) & ((1 << INDEX_BITS) - 1))
-    return (key << INDEX_BITS) | ((k + INDEX_OFFSET) & ((1 << INDEX_BITS) - 1))
-
-
-@kernel
-def _fill(
-    x: F4, y: F4, z: F4, usable: B1, edge: float, per_m: float, keys: I8, counts: I4
-) -> tuple[NDArray[np.int8], I4]:
-    """Counts the points of each voxel; returns the level (n,), -1 for points left out, and the slot (n,) of each."""
-    level, slot = np.full(len(x), -1, np.int8), np.zeros(len(x), np.int32)
-    found: Int = 0
-    last_key = EMPTY
+def _few_alongside(cell: I4, x: F4, y: F4, z: F4, reach_m: Float, reach_rad: Float, least: int) -> B1:
+    """Which points (n,) have fewer neighbours than that among those next to them in order."""
+    reach, linked = np.empty(len(x), np.float32), np.zeros(len(x), np.int8)
+    count, out = np.zeros(len(x), np.int8), np.empty(len(x), np.bool_)
     for n in range(len(x)):
-        if not usable[n]:
-            continue
-        px, py, pz = float(x[n]), float(y[n]), float(z[n])
-        at = _level(per_m * np.sqrt(px * px + py * py + pz * pz))
-        per_edge = 1.0 / (edge * (1 << at))
-        key = _key(
-            at, int(np.floor(px * per_edge)), int(np.floor(py * per_edge)), int(np.floor(pz * per_edge))
-        )
-        if key != last_key:
-            found = find_slot(keys, key)
-            keys[found] = key
-            last_key = key
-        counts[found] += 1
-        level[n], slot[n] = at, found
-    return level, slot
-
-
-@kernel
-def _lonely(
-    x: F4, y: F4, z: F4, level: NDArray[np.int8], slot: I4, edge: float, per_m: float, keys: I8, counts: I4, least: int
-) -> B1:  # fmt: skip
-    out = np.zeros(len(x), np.bool_)
+        r = np.sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n])
+        reach[n] = max(reach_m, reach_rad * r) if cell[n] >= 0 else np.float32(-1.0)
+    for d in range(1, ALONGSIDE + 1):
+        for n in range(len(x) - d):  # nothing is skipped, so that the compiler takes several points at once
+            most = max(abs(x[n + d] - x[n]), abs(y[n + d] - y[n]), abs(z[n + d] - z[n]))
+            linked[n] = np.int8((most < reach[n]) & (cell[n + d] >= 0))
+        for n in range(len(x) - d):
+            count[n] += linked[n]
+        for n in range(d, len(x)):
+            count[n] += linked[n - d]
     for n in range(len(x)):
-        if level[n] < 0 or counts[slot[n]] > least:
-            continue
-        if _alongside(x, y, z, level, n, edge, least):
-            continue
-        px, py, pz = float(x[n]), float(y[n]), float(z[n])
-        ratio = per_m * np.sqrt(px * px + py * py + pz * pz)
-        at = int(level[n])
-        seen = _around(px, py, pz, at, edge, keys, counts, least)
-        size = per_m * edge * (1 << at)  # the voxel's edge in units of `ratio`
-        if seen <= least and ratio + 2.0 * size > float(1 << at):
-            seen += _around(px, py, pz, at + 1, edge, keys, counts, least)
-        if seen <= least and at > 0 and ratio - 2.0 * size <= 0.5 * (1 << at):
-            seen += _around(px, py, pz, at - 1, edge, keys, counts, least)
-        out[n] = seen <= least
+        out[n] = (cell[n] >= 0) & (count[n] < least)
     return out
 
 
 @kernel
-def _alongside(x: F4, y: F4, z: F4, level: NDArray[np.int8], n: int, edge: float, enough: int) -> bool:
-    """Whether the points next in order alone suffice: what `_around` would find, without a look into the table."""
-    per_edge = 1.0 / (edge * (1 << level[n]))
-    i, j, k = int(np.floor(x[n] * per_edge)), int(np.floor(y[n] * per_edge)), int(np.floor(z[n] * per_edge))
-    seen = 1
-    for m in range(max(n - ALONGSIDE, 0), min(n + ALONGSIDE + 1, len(x))):
-        if m == n or level[m] != level[n]:
+def _lonely(
+    few: B1, cell: I4, x: F4, y: F4, z: F4, range_m: F4, row_rad: float, column_rad: float, reach_m: float,
+    reach_rad: float, least: int,
+) -> B1:  # fmt: skip
+    rows, columns = range_m.shape
+    out = np.zeros(len(x), np.bool_)
+    for n in range(len(x)):
+        if not few[n]:
             continue
-        if (
-            abs(int(np.floor(x[m] * per_edge)) - i) <= 1
-            and abs(int(np.floor(y[m] * per_edge)) - j) <= 1
-            and abs(int(np.floor(z[m] * per_edge)) - k) <= 1
-        ):
-            seen += 1
-            if seen > enough:
-                return True
-    return False
+        r = np.sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n])
+        reach = np.float32(max(reach_m, reach_rad * r))
+        up = min(int(reach / (r * row_rad) + 0.5), FARTHEST_ROWS)
+        aside = min(int(reach / (r * column_rad) + 0.5), FARTHEST_COLUMNS, (columns - 1) // 2)
+        v, u = cell[n] // columns, cell[n] % columns
+        seen = (
+            -1 if abs(range_m[v, u] - r) < reach else 0
+        )  # the point itself, or one before it, is in its cell
+        for i in range(max(v - up, 0), min(v + up + 1, rows)):
+            row, low, high = range_m[i], u - aside, u + aside + 1
+            seen += _near(row[max(low, 0) : min(high, columns)], r, reach)
+            if low < 0:
+                seen += _near(row[low + columns :], r, reach)
+            if high > columns:
+                seen += _near(row[: high - columns], r, reach)
+            if seen >= least:
+                break
+        out[n] = seen < least
+    return out
 
 
 @kernel
-def _around(
-    px: float, py: float, pz: float, level: int, edge: float, keys: I8, counts: I4, enough: int
-) -> int:
-    """Points in the 27 voxels of one level around a place; stops counting when there are more than `enough`."""
-    per_edge = 1.0 / (edge * (1 << level))
-    i, j, k = int(np.floor(px * per_edge)), int(np.floor(py * per_edge)), int(np.floor(pz * per_edge))
-    seen = 0
-    for a in range(27):  # 0, 1, -1 on each axis: the voxels nearby come first
-        di, dj, dk = (a // 3 % 3 + 1) % 3 - 1, (a % 3 + 1) % 3 - 1, (a // 9 + 1) % 3 - 1
-        found = find_slot(keys, _key(level, i + di, j + dj, k + dk))
-        if keys[found] != EMPTY:
-            seen += int(counts[found])
-            if seen > enough:
-                return seen
-    return seen
+def _near(ranges: F4, r: Float, reach: Float) -> Int:
+    """How many of some cells hold something at this range, give or take the reach."""
+    count = np.int32(0)
+    for k in range(len(ranges)):
+        count += np.int32((abs(ranges[k] - r) < reach) & (ranges[k] > 0.0))
+    return count

@@ -43,6 +43,8 @@ TAU = 2 * np.pi
 
 ATAN = tuple(np.float32(c / TAU) for c in (0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.0208351))
 ZERO, QUARTER, HALF, WHOLE, TINY = (np.float32(c) for c in (0.0, 0.25, 0.5, 1.0, 1e-30))
+ENDLESS, CALM_BITS = np.float32(np.inf), 32
+CALM = 1 << CALM_BITS
 BINS_PER_TURN, LAST_BIN = np.float32(2 * BINS), np.int32(BINS - 1)
 
 
@@ -137,17 +139,17 @@ def _step(middles: F8) -> float:
 @kernel
 def _elevations(x: F4, y: F4, z: F4, seen: B1) -> tuple[I2, I8, I8]:
     """Bin of elevation (n,), -1 for points that are not seen; points per bin, and those that tell beams apart per bin."""
-    out = np.full(len(x), -1, np.int16)
-    counts, still = np.zeros(BINS, np.int64), np.zeros(BINS, np.int64)
-    for n in range(len(x)):
+    out, calm = np.empty(len(x), np.int16), np.empty(len(x), np.bool_)
+    for n in range(len(x)):  # apart from the counting, so that the compiler takes several points at once
         square = x[n] * x[n] + y[n] * y[n]
-        if not seen[n] or not 0.0 < square + abs(z[n]) < np.inf:
-            continue
-        k = elevation_bin(np.sqrt(square), z[n])
-        out[n] = k
-        counts[k] += 1
-        still[k] += abs(z[n]) < STILL_PER_M * square
-    return out, counts, still
+        far = square + abs(z[n])
+        known = seen[n] & (far > ZERO) & (far < ENDLESS)
+        out[n] = elevation_bin(np.sqrt(square), z[n]) if known else -1
+        calm[n] = abs(z[n]) < STILL_PER_M * square
+    both = np.zeros(BINS + 1, np.int64)
+    for n in range(len(x)):
+        both[out[n] + 1] += CALM + 1 if calm[n] else 1
+    return out, both[1:] & (CALM - 1), both[1:] >> CALM_BITS
 
 
 @kernel
@@ -172,16 +174,20 @@ def _beams(counts: I8) -> tuple[I8, I8]:
 @kernel
 def _draw(x: F4, y: F4, z: F4, drawn: B1, elevation: I2, row: I4, point: I4, ranges: F4) -> I4:
     columns = point.shape[1]
-    cell = np.full(len(x), -1, np.int32)
+    cell, away = np.empty(len(x), np.int32), np.empty(len(x), np.float32)
+    width, last = np.float32(columns), np.int32(columns - 1)
+    for n in range(len(x)):  # apart from the drawing, so that the compiler takes several points at once
+        cell[n] = min(np.int32(turn_of(x[n], y[n]) * width), last)
+        away[n] = np.sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n])
+    points, nearest = point.ravel(), ranges.ravel()
     for n in range(len(x)):
         if not drawn[n] or elevation[n] < 0:
+            cell[n] = -1
             continue
-        v = row[elevation[n]]
-        u = min(int(turn_of(x[n], y[n]) * np.float32(columns)), columns - 1)
-        r = np.sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n])
-        cell[n] = v * columns + u
-        if point[v, u] < 0 or r < ranges[v, u]:
-            point[v, u], ranges[v, u] = n, r
+        k = row[elevation[n]] * columns + cell[n]
+        cell[n] = k
+        if points[k] < 0 or away[n] < nearest[k]:
+            points[k], nearest[k] = n, away[n]
     return cell
 
 
