@@ -25,7 +25,7 @@ VERTEX = np.dtype(
         ("intensity", "<f4"),
         ("class", "u1"),
         ("level", "u1"),
-        ("session", "<u2"),
+        ("session", "<i4"),
         ("count", "<i4"),
         ("first_s", "<f8"),
         ("last_s", "<f8"),

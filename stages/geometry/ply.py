@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 VERTEX = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("class", "u1")]
 )  # packed: 17 bytes a point
-_TYPES = {"<f4": "float", "<f8": "double", "<i4": "int", "<u2": "ushort", "|u1": "uchar"}
+_TYPES = {"<f4": "float", "<f8": "double", "<i4": "int", "|u1": "uchar"}
 
 
 def header(points: int, comments: Sequence[str], vertex: np.dtype[Any] = VERTEX) -> bytes:
