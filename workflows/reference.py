@@ -10,14 +10,24 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from scanloom.pipeline.node import Node
+from scanloom.schemas.metrics import METRICS, MetricKind
 from scanloom.schemas.product import Document, Files, Product, Stream, attributes_of, describe
 from scanloom.workflows.map_session import NODES
 
+METRICS_INTRODUCTION = """\
+`metrics.json` beside a map holds a list of rows: `name`, `value`, `unit`, `scope` (`session`, `map` or `run`), `method` (how it
+was computed, and from how many samples), `truth` (whether truth was needed), `samples` where it is no plain count, and
+`session` in maps of several. Units stand at the end of the names; `*` stands for what varies: a radius, a length, a reason.
+
+`scanloom compare A B` calls it a regression when a metric of B is worse than that of A by more than noise allows: with
+`--noise`, by more than two runs of the same log differ once in a thousand times (Student's t, from the standard deviation of
+the repeats); without, by more than the last column, the larger of a fixed amount and a share of the value in A.
+"""
 NOTE = "<!-- made from the code by `make docs`; do not edit -->\n\n"
 
 
 def write_pages(folder: Path) -> None:
-    """Write `products.md`, `stages.md` and one page per stage below `folder`."""
+    """Write `products.md`, `stages.md`, `metrics.md` and one page per stage below `folder`."""
     for name, text in pages().items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -26,7 +36,7 @@ def write_pages(folder: Path) -> None:
 
 def pages() -> dict[str, str]:
     """Text of every reference page by its path below the folder of documents."""
-    made = {"products.md": _products_page(), "stages.md": _stages_page()}
+    made = {"products.md": _products_page(), "stages.md": _stages_page(), "metrics.md": _metrics_page()}
     made |= {f"stages/{n.name}.md": _stage_page(n) for n in NODES}
     return made
 
@@ -70,6 +80,38 @@ def _stages_page() -> str:
         for n in NODES
     ]
     return NOTE + "# Stages\n" + _table(("stage", "per", "reads", "writes", "what it does"), rows)
+
+
+def _metrics_page() -> str:
+    """One line per metric, from the list that `compare` judges by."""
+    blocks = [NOTE, "# Metrics\n\n", METRICS_INTRODUCTION]
+    for title, truth in (("Without truth", False), ("Against truth", True)):
+        rows = [
+            (f"`{kind.name}`", kind.doc, _better(kind), _shown_tolerance(kind))
+            for kind in METRICS
+            if kind.truth == truth
+        ]
+        blocks += [
+            f"\n## {title}\n",
+            _table(("metric", "what it is", "better", "no regression up to"), rows),
+        ]
+    return "".join(blocks)
+
+
+def _better(kind: MetricKind) -> str:
+    return f"near {kind.target:g}" if kind.better == "target" else kind.better or "–"
+
+
+def _shown_tolerance(kind: MetricKind) -> str:
+    """What `compare` allows when no noise was measured."""
+    if not kind.better:
+        return "not judged"
+    if kind.varies:
+        return "judged with measured noise only"
+    parts = [f"{kind.absolute:g}"] * bool(kind.absolute) + [f"{100 * kind.relative:g} %"] * bool(
+        kind.relative
+    )
+    return " or ".join(parts) or "any change for the worse is one"
 
 
 def _stage_page(n: Node) -> str:

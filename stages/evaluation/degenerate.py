@@ -18,7 +18,9 @@ def degeneracy_figures(odometry: Odometry) -> Iterator[Figure]:
         return
     blind = unseen(odometry)
     how = f"with a direction seen beyond noise with a probability under {SEEN_P:g}"
-    yield Figure("odometry.degenerate_share", float(blind.mean()), "", f"share of scans {how}")
+    yield Figure(
+        "odometry.degenerate_share", float(blind.mean()), "", f"share of scans {how}", samples=len(blind)
+    )
     travelled = alignment.travelled(odometry.T_odom_lidar)
     longest = max((travelled[b] - travelled[a] for a, b in stretches(blind)), default=0.0)
     yield Figure("odometry.degenerate_longest_m", float(longest), "m", f"longest way without a break {how}")

@@ -27,6 +27,11 @@ class Figure:
     samples: int | None = None
     """From how many samples it was computed; None for a plain count of everything."""
 
+    @property
+    def how(self) -> str:
+        """Method and number of samples."""
+        return self.method if self.samples is None else f"{self.method}; {self.samples} samples"
+
 
 def needs_truth(name: str) -> bool:
     """Whether a metric is computed with the help of truth."""
@@ -47,7 +52,7 @@ def to_metrics(figures: Iterable[Figure]) -> Metrics:
         unit=strings("unit"),
         scope=strings("scope"),
         session=strings("session"),
-        method=strings("method"),
+        method=strings("how"),
         samples=np.array([-1 if row.samples is None else row.samples for row in rows], np.int64),
         truth=np.array([needs_truth(row.name) for row in rows], bool),
     )

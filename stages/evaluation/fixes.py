@@ -43,13 +43,31 @@ def _status_figures(
 ) -> Iterator[Figure]:
     name, about = f"gnss.status_{status}", f"receiver status {status}, {STATUS.get(status, 'unknown')}"
     yield Figure(f"{name}.fixes", int(rows.sum()), "", f"messages with {about}")
-    yield Figure(f"{name}.used_share", float(fixes.used[rows].mean()), "", f"share in use of {about}")
+    yield Figure(
+        f"{name}.used_share",
+        float(fixes.used[rows].mean()),
+        "",
+        f"share in use of {about}",
+        samples=int(rows.sum()),
+    )
     distance = fixes.horizontal_m[rows]
     distance = distance[np.isfinite(distance)]
     if georeferenced and len(distance):
         how = f"horizontal distance of fix and antenna at the solution, used or not; {about}"
-        yield Figure(f"{name}.residual_median_m", float(np.median(distance)), "m", f"median {how}")
-        yield Figure(f"{name}.residual_p95_m", float(np.quantile(distance, 0.95)), "m", f"95 % {how}")
+        yield Figure(
+            f"{name}.residual_median_m",
+            float(np.median(distance)),
+            "m",
+            f"median {how}",
+            samples=len(distance),
+        )
+        yield Figure(
+            f"{name}.residual_p95_m",
+            float(np.quantile(distance, 0.95)),
+            "m",
+            f"95 % {how}",
+            samples=len(distance),
+        )
 
 
 def true_fix_figures(gnss: Gnss, fixes: FixRows, poses: Poses, truth: Truth) -> Iterator[Figure]:
@@ -62,8 +80,12 @@ def true_fix_figures(gnss: Gnss, fixes: FixRows, poses: Poses, truth: Truth) -> 
     used = error_m[known & fixes.used]
     how = "horizontal error of the fixes in use, by truth"
     if len(used):
-        yield Figure("gnss.used_error_median_m", float(np.median(used)), "m", f"median {how}")
-        yield Figure("gnss.used_error_p95_m", float(np.quantile(used, 0.95)), "m", f"95 % {how}")
+        yield Figure(
+            "gnss.used_error_median_m", float(np.median(used)), "m", f"median {how}", samples=len(used)
+        )
+        yield Figure(
+            "gnss.used_error_p95_m", float(np.quantile(used, 0.95)), "m", f"95 % {how}", samples=len(used)
+        )
     wrong = known & (error_m > WRONG_M) & (error_m > WRONG_SIGMAS * _claimed_sigma(gnss))
     about = f"fixes off by more than {WRONG_M:g} m and {WRONG_SIGMAS:g} times the receiver's own standard deviation"
     yield Figure("gnss.wrong_fixes", int(wrong.sum()), "", about)

@@ -93,16 +93,17 @@ def _coverage(true: F8, covered: NDArray[np.bool_], source: str) -> Iterator[Fig
 def _error_figures(name: str, true: F8, estimate: F8) -> Iterator[Figure]:
     errors = alignment.absolute_errors(true, estimate)
     how = "distance to truth after one rigid alignment of all positions (Umeyama, no scale)"
-    yield Figure(f"{name}.ate_rmse_m", alignment.rms(errors), "m", f"root mean square {how}")
-    yield Figure(f"{name}.ate_max_m", float(errors.max()), "m", f"largest {how}")
+    n = len(errors)
+    yield Figure(f"{name}.ate_rmse_m", alignment.rms(errors), "m", f"root mean square {how}", samples=n)
+    yield Figure(f"{name}.ate_max_m", float(errors.max()), "m", f"largest {how}", samples=n)
     for length in RPE_LENGTHS_M:
         relative = alignment.relative_errors(true, estimate, float(length))
         if len(relative):
             how = f"root mean square error of the motion over {length} m of path, from every scan"
-            yield Figure(f"{name}.rpe{length}_m", alignment.rms(relative.translation_m), "m", how)
-            yield Figure(
-                f"{name}.rpe{length}_deg", alignment.rms(np.degrees(relative.rotation_rad)), "deg", how
-            )
+            metres, degrees = relative.translation_m, np.degrees(relative.rotation_rad)
+            n = len(relative)
+            yield Figure(f"{name}.rpe{length}_m", alignment.rms(metres), "m", how, samples=n)
+            yield Figure(f"{name}.rpe{length}_deg", alignment.rms(degrees), "deg", how, samples=n)
     kitti = alignment.kitti_errors(true, estimate)
     if kitti:
         how = f"KITTI odometry benchmark: mean over {kitti.segments} segments of 100 to 800 m from every tenth scan"
@@ -112,8 +113,9 @@ def _error_figures(name: str, true: F8, estimate: F8) -> Iterator[Figure]:
 
 def _absolute_figures(errors: F8) -> Iterator[Figure]:
     how = "distance to truth on the Earth, nothing aligned"
-    yield Figure("fusion.absolute_rmse_m", alignment.rms(errors), "m", f"root mean square {how}")
-    yield Figure("fusion.absolute_max_m", float(errors.max()), "m", f"largest {how}")
+    n = len(errors)
+    yield Figure("fusion.absolute_rmse_m", alignment.rms(errors), "m", f"root mean square {how}", samples=n)
+    yield Figure("fusion.absolute_max_m", float(errors.max()), "m", f"largest {how}", samples=n)
 
 
 def on_earth(truth: Truth, poses: Poses) -> F8 | None:
@@ -134,4 +136,5 @@ def _honesty(true: F8, estimate: F8, covariance: F8, how: str) -> Figure:
     method = (
         f"mean squared error of position over its marginal covariance, {how}; 3 is honest, more is too sure"
     )
-    return Figure("fusion.nees_translation", float(squared.mean()) if len(squared) else np.nan, "", method)
+    mean = float(squared.mean()) if len(squared) else np.nan
+    return Figure("fusion.nees_translation", mean, "", method, samples=len(squared))

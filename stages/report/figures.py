@@ -18,6 +18,8 @@ class Row:
     value: float
     unit: str
     method: str
+    truth: bool = False
+    """Whether truth was needed."""
 
     @property
     def text(self) -> str:
@@ -47,7 +49,8 @@ class Figures:
     def __init__(self, metrics: Metrics) -> None:
         self._rows: dict[str, list[Row]] = {}
         for i in range(len(metrics)):
-            row = Row(metrics.name[i], float(metrics.value[i]), metrics.unit[i], metrics.method[i])
+            value, truth = float(metrics.value[i]), bool(metrics.truth[i])
+            row = Row(metrics.name[i], value, metrics.unit[i], metrics.method[i], truth)
             self._rows.setdefault(metrics.session[i], []).append(row)
 
     def rows(self, session: str = "") -> list[Row]:

@@ -39,7 +39,7 @@ def headline_cards(sessions: dict[str, Session], figures: Figures) -> list[Card]
 
 @dataclass(frozen=True)
 class MetricTable:
-    """Metrics of a session or of the map: those of odometry beside the map's, and the rest."""
+    """Metrics of a session or of the map, with truth or without: those of odometry beside the map's, and the rest."""
 
     title: str
     pairs: list[Pair]
@@ -47,9 +47,19 @@ class MetricTable:
 
 
 def metric_tables(sessions: dict[str, Session], figures: Figures) -> list[MetricTable]:
-    """A table per session and one of the map; empty ones are left out."""
-    tables = [MetricTable(f"Session {name}", figures.pairs(name), figures.single(name)) for name in sessions]
-    tables.append(MetricTable("Map", [], figures.single()))
+    """Tables per session and of the map, what was held against truth apart from what needs none; empty ones are left out."""
+    tables = []
+    for title, session in (*((f"Session {name}", name) for name in sessions), ("Map", "")):
+        pairs = figures.pairs(session) if session else []
+        rows = figures.single(session)
+        for truth, about in ((True, "against truth"), (False, "without truth")):
+            tables.append(
+                MetricTable(
+                    f"{title}, {about}",
+                    [pair for pair in pairs if pair.any.truth == truth],
+                    [row for row in rows if row.truth == truth],
+                )
+            )
     return [table for table in tables if table.pairs or table.rows]
 
 

@@ -13,6 +13,8 @@ from scanloom.stages.report.figures import Figures, number
 Level = Literal["pass", "note", "warn", "fail"]
 
 
+LEAST_PATCHES = 200
+"""Fewer patches of walls say nothing of the map."""
 BLIND_WAY_M = 5.0
 """Shorter ways without a view of every direction are not worth a word."""
 
@@ -36,6 +38,8 @@ class Limits:
     ate_warn_m: float
     drift_warn_percent: float
     open_path_warn_m: float
+    double_warn: float = 0.05
+    double_fail: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,7 @@ def _map_checks(limits: Limits, sessions: Iterable[str], figures: Figures) -> It
     if apart_m is not None:
         level = _level(apart_m, limits.ate_warn_m, 10 * limits.ate_warn_m)
         yield Check(level, f"Sessions lie within {apart_m:.2f} m of each other where they meet, by truth.")
+    yield from _wall_checks(limits, figures)
     georeferenced = bool(figures.get("fusion.georeferenced"))
     if not georeferenced:
         yield Check(
@@ -93,6 +98,22 @@ def _map_checks(limits: Limits, sessions: Iterable[str], figures: Figures) -> It
         path_m = sum(figures.get("fusion.path_length_m", name) or 0.0 for name in sessions)
         level = "warn" if path_m > limits.open_path_warn_m else "note"
         yield Check(level, "Neither GNSS nor a loop bounds the drift: accuracy falls with distance driven.")
+
+
+def _wall_checks(limits: Limits, figures: Figures) -> Iterator[Check]:
+    """What users see first when passes do not fit."""
+    share, patches = figures.get("map.wall_double_share"), figures.get("map.wall_patches") or 0.0
+    if share is None or patches < LEAST_PATCHES:
+        return
+    level = _level(share, limits.double_warn, limits.double_fail)
+    if level == "pass":
+        yield Check(level, f"Walls are single: {100 * share:.1f} % of {number(patches)} patches look double.")
+        return
+    gap_m = figures.get("map.wall_double_gap_median_m")
+    apart = "" if gap_m is None else f", {100 * gap_m:.0f} cm apart in the middle"
+    yield Check(
+        level, f"Walls are double in {100 * share:.0f} % of {number(patches)} patches{apart}: passes do not fit."
+    )  # fmt: skip
 
 
 def _graph_checks(graph: Graph) -> Iterator[Check]:
