@@ -47,7 +47,8 @@ class ErrorTrack(Table):
 
 @dataclass(frozen=True)
 class PictureFiles(Files):
-    """The map from above: `preview.png` with the trajectory on it, `plain.jpg` without, `overlay.svg` the marks alone."""
+    """The map from above: `preview.png` with the trajectory on it; by height, intensity and class without it; `overlay.svg`
+    the marks alone, `left_out.png` what is not in the map, `view.json` where in the map the pictures lie."""
 
     NAME: ClassVar[str] = "picture_files"
 

@@ -4,30 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.schemas.evaluation import ErrorTrack
 from scanloom.schemas.session import Session
-from scanloom.schemas.trajectory import Odometry, Poses
-from scanloom.stages.geometry.alignment import travelled
+from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.geometry.factor_rows import DOUBTED, FixRows, reason_counts
 from scanloom.stages.geometry.unseen import KINDS, stretches, unseen, unseen_kinds
-from scanloom.stages.report.charts import (
+from scanloom.stages.report.plots import (
     F8,
-    Bands,
-    Curve,
-    Dots,
-    Layer,
-    Strip,
-    chart,
-    exact,
-    line_chart,
+    NOTHING,
+    Plot,
+    Trace,
+    axis,
+    bands,
+    fixed,
     logarithmic,
+    rows_of,
+    short,
+    thin,
+    upwards,
 )
+from scanloom.stages.report.ways import DRIVEN, HOVER, Way, curve
 
-DRIVEN = "distance driven, m"
 SPARE = "another fix of the same stretch is used"
 """Verdict of good fixes that are not needed."""
 DOTS = {
@@ -38,16 +40,31 @@ DOTS = {
     "none": "no position to compare",
 }
 """Styles of fixes in the order they are drawn, and what they mean."""
-_LEAST_RESIDUAL_M, _LEAST_E1_M = 0.001, 0.001
+DOT_COLOURS = {"used": "--good", "spare": "--quiet", "gate": "--curve-2", "off": "--bad"}
+BLIND, NO_FIX = "--band", "--band-quiet"
+_LEAST_RESIDUAL_M, _LEAST_E1_M = 0.001, 0.0001
 
 
-def error_chart(track: ErrorTrack) -> str:
+def along(
+    session: str, label: str, way: Way, data: list[Trace], y_axis: dict[str, Any], **layout: Any
+) -> Plot:
+    """A figure over the distance driven by one session."""
+    x_axis = axis(DRIVEN, range=[0, round(way.length_m, 2) or 1.0], **layout.pop("x", {}))
+    return Plot(label, data, {"xaxis": x_axis, "yaxis": y_axis, **layout}, "along", session)
+
+
+def error_chart(session: str, track: ErrorTrack, way: Way) -> Plot:
     """Errors against truth of odometry and of the map."""
-    curves = [
-        Curve("odometry, laid over truth at the first scan", track.travelled_m, track.odometry_error_m, 2),
-        Curve("map, aligned as a whole", track.travelled_m, track.fusion_error_m, 1),
+    if not len(track) or not len(way):
+        return NOTHING
+    rows = way.at_stamps(track.stamp_ns)
+    odometry = "odometry, laid over truth at the first scan"
+    data = [
+        curve(odometry, way, rows, track.odometry_error_m, "--curve-2", "m"),
+        curve("map, aligned to truth as a whole", way, rows, track.fusion_error_m, "--curve-1", "m"),
     ]
-    return line_chart(curves, DRIVEN, "distance to truth, m")
+    both = np.concatenate((track.odometry_error_m, track.fusion_error_m))
+    return along(session, "Distance to truth along the way", way, data, upwards("distance to truth, m", both))
 
 
 @dataclass(frozen=True)
@@ -61,13 +78,13 @@ class VerdictCount:
 
 @dataclass(frozen=True)
 class FixTrack:
-    """GNSS of one session along its way: the drawing, empty without a georeference, and the verdicts below it."""
+    """GNSS of one session along its way: the figure, empty without a georeference, and the verdicts below it."""
 
-    chart: str
+    plot: Plot
     verdicts: list[VerdictCount]
 
 
-def fix_track(fixes: FixRows, poses: Poses) -> FixTrack:
+def fix_track(session: str, fixes: FixRows, way: Way, georeferenced: bool) -> FixTrack:
     """Horizontal residual of every fix with a position over the distance driven, coloured by verdict."""
     kinds = np.array([dot_kind(str(text)) for text in fixes.verdict], object)
     kinds[~np.isfinite(fixes.horizontal_m)] = "none"
@@ -76,7 +93,8 @@ def fix_track(fixes: FixRows, poses: Poses) -> FixTrack:
         for kind in DOTS
         for text, count in reason_counts(fixes.verdict[kinds == kind]).items()
     ]
-    return FixTrack(_fix_chart(fixes, poses, kinds), counts)
+    drawn = georeferenced and len(way) > 0 and bool(np.isfinite(fixes.horizontal_m).any())
+    return FixTrack(_fix_chart(session, fixes, way, kinds) if drawn else NOTHING, counts)
 
 
 def dot_kind(verdict: str) -> str:
@@ -88,64 +106,88 @@ def dot_kind(verdict: str) -> str:
     return "off" if verdict.startswith(DOUBTED) else "gate"
 
 
-def _fix_chart(fixes: FixRows, poses: Poses, kinds: np.ndarray) -> str:
+def _fix_chart(session: str, fixes: FixRows, way: Way, kinds: NDArray[np.object_]) -> Plot:
     distance = fixes.horizontal_m
-    seen = np.isfinite(distance)
-    if poses.georeference is None or not seen.any():
-        return ""
-    way = travelled(poses.T_world_lidar)
-    row = np.clip(np.searchsorted(poses.scan_index, fixes.scan_index), 0, len(poses) - 1)
-    x = way[row]
-    y_axis = logarithmic(_LEAST_RESIDUAL_M, float(distance[seen].max()))
+    row = way.at_scans(fixes.scan_index)
+    data = []
+    for kind, colour in DOT_COLOURS.items():
+        chosen = np.flatnonzero(np.isfinite(distance) & (kinds == kind))
+        if len(chosen):
+            data.append(_dots(DOTS[kind], way, row[chosen], distance[chosen], colour))
     without = np.asarray(~np.isfinite(fixes.position_m).all(axis=1))
-    layers: list[Layer] = [Bands("no position from the receiver", _ranges(without, x), "quiet")]
-    for kind, label in DOTS.items():
-        chosen = seen & (kinds == kind)
-        if chosen.any():
-            layers.append(Dots(label, x[chosen], distance[chosen], kind))
-    return chart(layers, exact(float(way[-1])), y_axis, DRIVEN, "from fix to antenna, m")
+    missing = bands(_ranges(without, way.driven_m[row]), NO_FIX, way.length_m)
+    y_axis = logarithmic("from fix to antenna, m", distance, _LEAST_RESIDUAL_M)
+    return along(session, "Residuals of the GNSS fixes along the way", way, data, y_axis, shapes=missing)
+
+
+def _dots(label: str, way: Way, rows: NDArray[np.int64], y: F8, colour: str) -> Trace:
+    kept = thin(y)
+    at = rows[kept]
+    return {
+        "type": "scatter", "mode": "markers", "name": label, "x": fixed(way.driven_m[at]),
+        "y": short(np.maximum(y[kept], _LEAST_RESIDUAL_M)), "customdata": way.told(at),
+        "marker": {"color": colour, "size": 5}, "hovertemplate": HOVER.replace("UNIT", "m"), "showlegend": True,
+    }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Blindness:
     """Degeneracy of one session along its way, and how much of the way had an unseen direction."""
 
-    chart: str
+    plot: Plot
     share: float
     longest_m: float
 
 
-def blindness(odometry: Odometry, session: Session) -> Blindness:
+def blindness(name: str, odometry: Odometry, session: Session, way: Way) -> Blindness:
     """E1 over the distance driven, with the stretches where a direction was unseen and which one it was."""
     if len(odometry) < 2:
-        return Blindness("", 0.0, 0.0)
-    way = travelled(odometry.T_odom_lidar)
+        return Blindness(NOTHING, 0.0, 0.0)
+    rows = way.at_scans(odometry.scan_index)
+    driven = way.driven_m[rows]
     blind = unseen(odometry)
-    ranges = _ranges(blind, way)
+    ranges = _ranges(blind, driven)
     kinds = unseen_kinds(odometry, np.array(session.T_base("lidar"))[:3, :3])
-    strips = [Strip(label, _ranges(kinds[:, k], way), "blind") for k, label in enumerate(KINDS)]
-    drawn = _blind_chart(odometry.degeneracy_e[1:], way, ranges, strips)
+    by_kind = [_ranges(kinds[:, k], driven) for k in range(len(KINDS))]
     longest = float((ranges[:, 1] - ranges[:, 0]).max(initial=0.0))
-    return Blindness(drawn, float(blind.mean()), longest)
+    return Blindness(_blind_chart(name, odometry, way, rows, ranges, by_kind), float(blind.mean()), longest)
 
 
-def _blind_chart(e1_m: F8, way: F8, ranges: F8, strips: list[Strip]) -> str:
-    known = np.isfinite(e1_m)
-    if not known.any():
-        return ""
-    layers: list[Layer] = [
-        Bands("a direction was not seen", ranges, "blind"),
-        Curve("E1", way[1:][known], e1_m[known], 1),
+def _blind_chart(
+    name: str, odometry: Odometry, way: Way, rows: NDArray[np.int64], ranges: F8, by_kind: list[F8]
+) -> Plot:
+    e1_m = odometry.degeneracy_e[1:]
+    if not np.isfinite(e1_m).any():
+        return NOTHING
+    data = [
+        curve(
+            "E1: expected error of the worst direction",
+            way,
+            rows[1:],
+            np.maximum(e1_m, _LEAST_E1_M),
+            "--curve-1",
+            "m",
+        )
     ]
-    y_axis = logarithmic(_LEAST_E1_M, float(e1_m[known].max()))
-    return chart(layers, exact(float(way[-1])), y_axis, DRIVEN, "E1, m", strips)
+    y_axis = logarithmic("E1, m", e1_m, _LEAST_E1_M)
+    layout: dict[str, Any] = {"shapes": bands(ranges, BLIND, way.length_m)}
+    if len(ranges):
+        strips, below = rows_of(KINDS, by_kind, "--curve-2", way.length_m)
+        data += strips
+        y_axis["domain"] = [below["domain"][1] + 0.03, 1]
+        layout |= {"yaxis2": below, "x": {"anchor": "y2"}}
+    return along(name, "Expected error of the worst direction along the way", way, data, y_axis, **layout)
 
 
 def blind_sessions(
-    sessions: Mapping[str, Session], odometries: Mapping[str, Odometry]
+    sessions: Mapping[str, Session], odometries: Mapping[str, Odometry], ways: Mapping[str, Way]
 ) -> dict[str, Blindness]:
     """`blindness` of every session with odometry."""
-    return {name: blindness(odometries[name], sessions[name]) for name in sessions if name in odometries}
+    return {
+        name: blindness(name, odometries[name], sessions[name], ways[name])
+        for name in sessions
+        if name in ways and name in odometries
+    }
 
 
 def _ranges(marked: NDArray[np.bool_], way: F8) -> F8:

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.schemas.changes import Changes
-from scanloom.schemas.trajectory import Poses
-from scanloom.stages.report.plan import Plan, drawable
+from scanloom.stages.report.plan import marks_plan
+from scanloom.stages.report.plots import NOTHING, Plot, Trace
+from scanloom.stages.report.ways import Way
 
 _MOST_LISTED = 12
 
@@ -31,8 +32,7 @@ class Changed:
     """All objects that are gone, the largest listed; `sessions` are those that looked."""
 
     sessions: tuple[str, ...]
-    svg: str
-    scale: str
+    plot: Plot
     objects: int
     points: int
     remnants: int
@@ -40,7 +40,7 @@ class Changed:
     listed: list[Gone]
 
 
-def changed(paths: Mapping[str, Poses], changes: Changes | None) -> Changed | None:
+def changed(ways: Mapping[str, Way], changes: Changes | None) -> Changed | None:
     """What the new sessions saw through; None for a map that extends none."""
     if changes is None or not changes.sessions:
         return None
@@ -48,9 +48,13 @@ def changed(paths: Mapping[str, Poses], changes: Changes | None) -> Changed | No
     rows = np.split(np.argsort(changes.object_, kind="stable"), np.cumsum(counts)[:-1])
     objects = [_gone(changes, part) for part in rows if len(part)]
     objects.sort(key=lambda gone: -gone.points)
-    svg, scale = _drawn(paths, objects)
     return Changed(
-        changes.sessions, svg, scale, len(numbers), len(changes), changes.remnants, objects[:_MOST_LISTED]
+        changes.sessions,
+        _drawn(ways, objects),
+        len(numbers),
+        len(changes),
+        changes.remnants,
+        objects[:_MOST_LISTED],
     )
 
 
@@ -62,12 +66,15 @@ def _gone(changes: Changes, rows: NDArray[np.int64]) -> Gone:
     return Gone((x, y, z), (length, width, height), len(rows), float(np.median(changes.through[rows])))
 
 
-def _drawn(paths: Mapping[str, Poses], objects: list[Gone]) -> tuple[str, str]:
-    """The objects as dots on the tracks, and the length of the scale bar."""
-    if not (objects and drawable(paths)):
-        return "", ""
-    plan = Plan(paths)
-    pixels = plan.view.pixels(np.array([gone.middle_m[:2] for gone in objects]))
-    dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in pixels.tolist())
-    mark = f'<path d="{dots}" class="ends edge-doubted"><title>no longer there</title></path>'
-    return plan.draw(mark, "what has changed, from above"), plan.scale
+def _drawn(ways: Mapping[str, Way], objects: list[Gone]) -> Plot:
+    """The objects as dots on the tracks."""
+    if not objects:
+        return NOTHING
+    size = [" × ".join(f"{side:.1f}" for side in gone.size_m) for gone in objects]
+    dots: Trace = {
+        "type": "scatter", "mode": "markers", "name": "no longer there",
+        "x": [round(gone.middle_m[0], 1) for gone in objects], "y": [round(gone.middle_m[1], 1) for gone in objects],
+        "text": [f"{gone.points} points, {sides} m" for gone, sides in zip(objects, size)],
+        "hovertemplate": "%{text}<extra></extra>", "marker": {"color": "--bad", "size": 8}, "showlegend": True,
+    }  # fmt: skip
+    return marks_plan("What has changed, from above", ways, [dots])

@@ -12,13 +12,16 @@ from scanloom.schemas.loops import Loops
 from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.trajectory import Poses
 from scanloom.stages.geometry.factor_rows import USED, loop_verdicts, reason_counts
-from scanloom.stages.report.plan import Plan
-from scanloom.stages.report.raster import View
+from scanloom.stages.report.figures import number
+from scanloom.stages.report.plan import marks_plan
+from scanloom.stages.report.plots import NOTHING, Plot, Trace, fixed, plain
+from scanloom.stages.report.ways import Way
 
 F8 = NDArray[np.float64]
 
 _MAX_EDGES = 600
 _MAX_REASONS = 8
+_MAX_PAIRS = 60
 
 USED_WITHIN, USED_BETWEEN, DOUBTED, REFUSED = "within", "between", "doubted", "refused"
 EDGES = {
@@ -28,6 +31,7 @@ EDGES = {
     USED_BETWEEN: "in use, between sessions",
 }
 """Kinds of edges in the order they are drawn, and what the legend says."""
+COLOURS = {REFUSED: "--curve-2", DOUBTED: "--bad", USED_WITHIN: "--good", USED_BETWEEN: "--curve-3"}
 
 
 @dataclass(frozen=True)
@@ -47,16 +51,27 @@ class Reason:
 
 
 @dataclass(frozen=True)
-class LoopGraph:
-    """The drawing, its legend and the reasons; the drawing is empty without loops."""
+class Pair:
+    """One candidate: its scans, how well they fit, what became of it and why."""
 
-    svg: str
-    scale: str
-    """How long the bar at the lower left is."""
+    kind: str
+    scans: str
+    rmse: str
+    overlap: str
+    outcome: str
+
+
+@dataclass(frozen=True)
+class LoopGraph:
+    """The figure, its legend and the reasons; the figure is empty without loops."""
+
+    plot: Plot
     edges: list[EdgeCount]
     reasons: list[Reason]
     other_reasons: int
     """Pairs refused for reasons that the list has no room for."""
+    pairs: list[Pair]
+    """Those accepted first, as many as a list has room for."""
 
     @property
     def used(self) -> int:
@@ -64,7 +79,7 @@ class LoopGraph:
         return sum(edge.count for edge in self.edges if edge.kind in (USED_WITHIN, USED_BETWEEN))
 
 
-def loop_graph(paths: Mapping[str, Poses], loops: Loops, graph: Graph) -> LoopGraph:
+def loop_graph(paths: Mapping[str, Poses], ways: Mapping[str, Way], loops: Loops, graph: Graph) -> LoopGraph:
     """Every candidate as an edge between its two places."""
     verdicts = loop_verdicts(loops, graph)
     kinds = edge_kinds(loops, verdicts)
@@ -75,15 +90,9 @@ def loop_graph(paths: Mapping[str, Poses], loops: Loops, graph: Graph) -> LoopGr
     ]
     reasons = _reasons(loops, verdicts, kinds)
     left = sum(reason.count for reason in reasons[_MAX_REASONS:])
-    ends = loop_ends(paths, loops)
-    drawn = np.isfinite(ends).all(axis=(1, 2))
-    if not drawn.any():
-        return LoopGraph("", "", counts, reasons[:_MAX_REASONS], left)
-    plan = Plan(paths)
-    marks = "".join(_edges(plan.view, ends[drawn & (kinds == kind)], kind) for kind in EDGES)
-    return LoopGraph(
-        plan.draw(marks, "loop graph from above"), plan.scale, counts, reasons[:_MAX_REASONS], left
-    )
+    pairs = [_pair(loops, kinds, verdicts, k) for k in _listed(kinds)]
+    plot = _drawn(paths, ways, loops, kinds)
+    return LoopGraph(plot, counts, reasons[:_MAX_REASONS], left, pairs)
 
 
 def edge_kinds(loops: Loops, verdicts: NDArray[np.object_]) -> NDArray[np.object_]:
@@ -124,15 +133,68 @@ def loop_ends(paths: Mapping[str, Poses], loops: Loops) -> F8:
     return ends
 
 
-def _edges(view: View, ends: F8, kind: str) -> str:
-    """One path of all edges of a kind; a thinned choice of them when there are very many."""
-    if not len(ends):
-        return ""
-    chosen = ends[:: -(-len(ends) // _MAX_EDGES)]
-    pixels = view.pixels(chosen.reshape(-1, 2)).reshape(-1, 4)
-    path = "".join(f"M{a:.1f} {b:.1f}L{c:.1f} {d:.1f}" for a, b, c, d in pixels)
-    dots = "".join(f"M{a:.1f} {b:.1f}h0M{c:.1f} {d:.1f}h0" for a, b, c, d in pixels)
-    return (
-        f'<path d="{path}" class="edge edge-{kind}"><title>{EDGES[kind]}</title></path>'
-        f'<path d="{dots}" class="ends edge-{kind}"/>'
-    )
+def _drawn(
+    paths: Mapping[str, Poses], ways: Mapping[str, Way], loops: Loops, kinds: NDArray[np.object_]
+) -> Plot:
+    ends = loop_ends(paths, loops)
+    known = np.isfinite(ends).all(axis=(1, 2))
+    if not known.any():
+        return NOTHING
+    marks = []
+    for kind in EDGES:
+        rows = np.flatnonzero(known & (kinds == kind))
+        marks += _edges(loops, ends, rows[:: max(-(-len(rows) // _MAX_EDGES), 1)], kind)
+    return marks_plan("Loops from above", ways, marks)
+
+
+def _edges(loops: Loops, ends: F8, rows: NDArray[np.int64], kind: str) -> list[Trace]:
+    """Edges of a kind as one line with gaps and dots at its ends; a thinned choice of them when there are very many."""
+    if not len(rows):
+        return []
+    gaps = np.full((len(rows), 1, 2), np.nan)
+    xy = np.concatenate((ends[rows], gaps), axis=1).reshape(-1, 2)
+    used = kind in (USED_WITHIN, USED_BETWEEN)
+    shape = {
+        "type": "scatter",
+        "name": EDGES[kind],
+        "x": fixed(xy[:, 0]),
+        "y": fixed(xy[:, 1]),
+        "legendgroup": kind,
+    }
+    told = [plain(_told(loops, k)) for k in rows for _ in range(3)]
+    line = {"color": COLOURS[kind], "width": 1.8 if used else 1.0, "dash": "solid" if used else "dot"}
+    dots = {"color": COLOURS[kind], "size": 6 if used else 4}
+    return [
+        {**shape, "mode": "lines", "line": line, "hoverinfo": "skip", "showlegend": True},
+        {
+            **shape,
+            "mode": "markers",
+            "marker": dots,
+            "text": told,
+            "hovertemplate": "%{text}<extra></extra>",
+            "showlegend": False,
+        },
+    ]
+
+
+def _told(loops: Loops, k: int) -> str:
+    reason = "" if loops.accepted[k] else f": {loops.reason[k]}"
+    return f"{_scans(loops, k)}, rmse {loops.rmse_m[k]:.2f} m, overlap {100 * loops.overlap[k]:.0f} %{reason}"
+
+
+def _scans(loops: Loops, k: int) -> str:
+    i, j = loops.session_i[k], loops.session_j[k]
+    if i == j:
+        return f"scans {loops.scan_i[k]} and {loops.scan_j[k]}"
+    return f"{i} scan {loops.scan_i[k]} and {j} scan {loops.scan_j[k]}"
+
+
+def _listed(kinds: NDArray[np.object_]) -> list[int]:
+    order = [USED_BETWEEN, USED_WITHIN, DOUBTED, REFUSED]
+    return [int(k) for kind in order for k in np.flatnonzero(kinds == kind)][:_MAX_PAIRS]
+
+
+def _pair(loops: Loops, kinds: NDArray[np.object_], verdicts: NDArray[np.object_], k: int) -> Pair:
+    outcome = {REFUSED: str(loops.reason[k]), DOUBTED: str(verdicts[k])}.get(kinds[k], "in use")
+    rmse, overlap = number(float(loops.rmse_m[k])), number(round(100 * float(loops.overlap[k]), 1))
+    return Pair(str(kinds[k]), _scans(loops, k), rmse, overlap, outcome)

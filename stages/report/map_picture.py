@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import json
+from dataclasses import asdict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +24,10 @@ from scanloom.stages.report.raster import View, draw_map, fit_view
 
 VERSION = 1
 
-PREVIEW, PLAIN, OVERLAY, LEFT_OUT = "preview.png", "plain.jpg", "overlay.svg", "left_out.png"
+PREVIEW, OVERLAY, LEFT_OUT, VIEW = "preview.png", "overlay.svg", "left_out.png", "view.json"
+LAYERS = {"height": "height.webp", "intensity": "intensity.webp", "classes": "classes.webp"}
+"""The map alone, coloured by what the key says."""
+_QUALITY = 80
 
 
 class Settings(BaseModel):
@@ -48,24 +53,32 @@ def picture(
     """Draw the map, tile by tile, what lies on it, and on a sheet of its own what was left out of it."""
     paths = {c["session"]: p for c, p in poses.items()}
     view = _view(settings, paths, tile_index)
-    plain, view = _enlarge(draw_map(tiles, view), view, settings.longest_px)
+    drawn = draw_map(tiles, view)
+    factor = max(settings.longest_px // max(view.width, view.height), 1)
+    view = view.enlarged(factor)
+    layers = {
+        "height": _enlarge(drawn.height, view, Image.Resampling.BICUBIC),
+        "intensity": _enlarge(drawn.intensity, view, Image.Resampling.BICUBIC),
+        "classes": _enlarge(drawn.classes, view, Image.Resampling.NEAREST),
+    }
     marks: list[Mark] = map_marks(view, paths, loops, graph) + scale_bar(view)
     return PictureFiles(
         contents={
-            PREVIEW: _encoded(paint(plain, marks), "PNG", compress_level=3),
-            PLAIN: _encoded(Image.fromarray(plain), "JPEG", quality=88),
+            PREVIEW: _encoded(paint(np.asarray(layers["height"]), marks), "PNG", compress_level=3),
+            **{
+                LAYERS[name]: _encoded(image, "WEBP", quality=_QUALITY, method=4)
+                for name, image in layers.items()
+            },
             OVERLAY: to_svg(marks, view).encode(),
             LEFT_OUT: _encoded(left_out(removed or (), view), "PNG", optimize=1, transparency=0),
+            VIEW: json.dumps(asdict(view)).encode(),
         }
     )
 
 
-def _enlarge(picture: NDArray[np.uint8], view: View, longest: int) -> tuple[NDArray[np.uint8], View]:
+def _enlarge(picture: NDArray[np.uint8], view: View, by: Image.Resampling) -> Image.Image:
     """A small map with larger pixels, so that lines and letters on it are sharp."""
-    factor = max(longest // max(view.width, view.height), 1)
-    enlarged = view.enlarged(factor)
-    image = Image.fromarray(picture).resize((enlarged.width, enlarged.height), Image.Resampling.BICUBIC)
-    return np.asarray(image), enlarged
+    return Image.fromarray(picture).resize((view.width, view.height), by)
 
 
 def _view(settings: Settings, paths: dict[str, Poses], index: TileIndex) -> View:

@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from scanloom.stages.report.templates import render, style
+from scanloom.stages.report.templates import asset, render, style
 
 
 def compose(body_html: str, run_section: str, title: str) -> str:
-    """The report as one file: the stage's body, then what varies from run to run."""
-    return render("page.html", title=title, style=style(), body=body_html, run_section=run_section)
+    """The report as one file: the stage's body, then what varies from run to run, and the scripts that draw its plots.
+
+    The page forbids itself to load anything and to run any other script, whatever the names in a log look like.
+    """
+    library, script = asset("vendor/plotly-basic.min.js"), asset("page.js")
+    hashes = " ".join(f"'sha256-{_sha256(text)}'" for text in (library, script))
+    policy = f"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src {hashes}"
+    return render(
+        "page.html", title=title, style=style(), body=body_html, run_section=run_section,
+        library=library, script=script, policy=policy,
+    )  # fmt: skip
+
+
+def _sha256(script: str) -> str:
+    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
 def run_section(stage_times: Sequence[Mapping[str, Any]], provenance: Mapping[str, str]) -> str:

@@ -1,70 +1,106 @@
-"""Plan views: the tracks from above in the colours of the page, with room for marks on them."""
+"""Figures from above: the tracks of all sessions, with marks on them, or coloured by what is known of each scan."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from html import escape
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from scanloom.schemas.trajectory import Poses
-from scanloom.stages.report.overlay import SESSION_COLOURS, round_length
-from scanloom.stages.report.raster import View, fit_view
+from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.report.overlay import SESSION_COLOURS
+from scanloom.stages.report.plots import I8, NOTHING, Plot, Trace, fixed, plain, short
+from scanloom.stages.report.ways import Way
 
-F8 = NDArray[np.float64]
-
-_WIDTH = 1000
-_MAX_PATH_POINTS = 1500
-_MARGIN = 0.06
-_LEAST_MARGIN_M = 3.0
-_KILOMETRE_M = 1000
+_MOST_BEADS = 2400
+"""Scans drawn, of all sessions together."""
+_PERCENTILES = (1.0, 99.0)
+PLAN_HOVER = "%{text}<br>scan %{customdata[0]}, stamp %{customdata[1]:.2f} s<br>%{customdata[2]:.1f} m driven<extra></extra>"
 
 
-class Plan:
-    """A window that shows all tracks; needs at least one pose."""
+@dataclass(frozen=True)
+class Quantity:
+    """What the track can be coloured by: values (n,) of the scans of each session."""
 
-    def __init__(self, paths: Mapping[str, Poses]) -> None:
-        self._paths = paths
-        corners = np.concatenate([poses.T_world_lidar[:, :2, 3] for poses in paths.values() if len(poses)])
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        margin = max(float((high - low).max()) * _MARGIN, _LEAST_MARGIN_M)
-        self.view: View = fit_view(low, high, margin, _WIDTH, 1e-3)
-        self._bar_m = round_length(self.view.width * self.view.pixel_m / 5)
-
-    @property
-    def scale(self) -> str:
-        """How long the bar at the lower left is."""
-        if self._bar_m >= _KILOMETRE_M:
-            return f"{self._bar_m / _KILOMETRE_M:g} km"
-        return f"{self._bar_m:g} m"
-
-    def draw(self, marks: str, label: str) -> str:
-        """The tracks with marks, in pixels of `view`, on them."""
-        tracks = "".join(
-            self._track(number, name, poses)
-            for number, (name, poses) in enumerate(self._paths.items())
-            if len(poses)
-        )
-        return (
-            f'<svg viewBox="0 0 {self.view.width} {self.view.height}" class="plan" role="img" '
-            f'aria-label="{escape(label)}">{tracks}{marks}{self._bar()}</svg>'
-        )
-
-    def _track(self, number: int, name: str, poses: Poses) -> str:
-        count = min(len(poses), _MAX_PATH_POINTS)
-        rows = np.unique(np.linspace(0, len(poses) - 1, count).round().astype(int))
-        xy = self.view.pixels(poses.T_world_lidar[rows, :2, 3])
-        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in xy.tolist())
-        style = f"track track-{number % len(SESSION_COLOURS)}" if len(self._paths) > 1 else "track"
-        return f'<polyline points="{points}" class="{style}"><title>{escape(name)}</title></polyline>'
-
-    def _bar(self) -> str:
-        view = self.view
-        x, y = 0.02 * view.width, view.height - 0.02 * view.width
-        return f'<path d="M{x:.1f} {y - 8:.1f}v8h{self._bar_m / view.pixel_m:.1f}v-8" class="bar-line"/>'
+    key: str
+    label: str
+    unit: str
+    values: dict[str, F8]
+    worse: bool = False
+    """More is worse."""
 
 
-def drawable(paths: Mapping[str, Poses]) -> bool:
-    """Whether there is a pose to draw."""
-    return any(len(poses) for poses in paths.values())
+def track_plan(ways: Mapping[str, Way], quantities: list[Quantity], marks: list[Trace]) -> Plot:
+    """Every session's track, which the page's script colours by the quantity that is chosen."""
+    if not ways:
+        return NOTHING
+    each = max(_MOST_BEADS // len(ways), 50)
+    rows = {name: _spread(len(way), each) for name, way in ways.items()}
+    data = _tracks(ways)
+    for number, (name, way) in enumerate(ways.items()):
+        data.append(_beads(name, way, rows[name], SESSION_COLOURS[number % len(SESSION_COLOURS)]))
+    more = {
+        "beads": {name: len(ways) + k for k, name in enumerate(ways)},
+        "colours": [_coloured(quantity, rows) for quantity in quantities],
+    }
+    return Plot(
+        "The tracks from above, coloured by a figure to choose", data + marks, _layout(), "plan", "", more
+    )
+
+
+def marks_plan(label: str, ways: Mapping[str, Way], marks: list[Trace]) -> Plot:
+    """The tracks in grey with marks on them."""
+    return Plot(label, _tracks(ways) + marks, _layout(), "plan") if ways and marks else NOTHING
+
+
+def _layout() -> dict[str, Any]:
+    square = {"scaleanchor": "x", "scaleratio": 1}
+    return {
+        "xaxis": {"title": {"text": "x, m", "standoff": 6}, "zeroline": False, "constrain": "range"},
+        "yaxis": {
+            "title": {"text": "y, m", "standoff": 6},
+            "zeroline": False,
+            "constrain": "range",
+            **square,
+        },
+    }
+
+
+def _tracks(ways: Mapping[str, Way]) -> list[Trace]:
+    lines: list[Trace] = []
+    for name, way in ways.items():
+        rows = _spread(len(way), _MOST_BEADS // max(len(ways), 1) + 50)
+        lines.append(
+            {
+                "type": "scatter", "mode": "lines", "name": plain(name), "x": fixed(way.place_m[rows, 0]),
+                "y": fixed(way.place_m[rows, 1]), "line": {"color": "--quiet", "width": 2}, "hoverinfo": "skip",
+                "showlegend": False,
+            }
+        )  # fmt: skip
+    return lines
+
+
+def _beads(name: str, way: Way, rows: I8, colour: str) -> Trace:
+    told = [[*pair, driven] for pair, driven in zip(way.told(rows), fixed(way.driven_m[rows], 1))]
+    return {
+        "type": "scatter", "mode": "markers", "name": plain(name), "x": fixed(way.place_m[rows, 0]),
+        "y": fixed(way.place_m[rows, 1]), "customdata": told, "text": plain(name), "hovertemplate": PLAN_HOVER,
+        "marker": {"size": 6, "color": colour}, "meta": name, "showlegend": False,
+    }  # fmt: skip
+
+
+def _coloured(quantity: Quantity, rows: Mapping[str, I8]) -> dict[str, Any]:
+    """Values at the drawn scans, and the range of colours: all but the rarest hundredth at each end."""
+    values = {name: found[rows[name]] for name, found in quantity.values.items() if name in rows}
+    known = np.concatenate([v[np.isfinite(v)] for v in values.values()] or [np.empty(0)])
+    low, high = np.percentile(known, _PERCENTILES) if len(known) else (0.0, 1.0)
+    return {
+        "key": quantity.key, "label": quantity.label, "unit": quantity.unit, "worse": quantity.worse, "low": float(f"{low:.4g}"),
+        "high": float(f"{max(high, low + 1e-6):.4g}"), "values": {name: short(v) for name, v in values.items()},
+    }  # fmt: skip
+
+
+def _spread(count: int, most: int) -> I8:
+    """Rows evenly over all, with the first and the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))

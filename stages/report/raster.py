@@ -1,4 +1,4 @@
-"""The map from above: points splatted into pixels, coloured by height above ground, shaded by depth."""
+"""The map from above: points splatted into pixels, coloured by height, intensity or class, shaded by depth."""
 
 from __future__ import annotations
 
@@ -16,10 +16,15 @@ from scanloom.stages.geometry.kernels import kernel
 BACKGROUND = (13, 17, 23)
 _GROUND_CELL_M = 4.0
 _TALL_M = 9.0
+_GROUND_M = 0.4
 _RAMP = np.array(
     [[62, 74, 102], [38, 112, 142], [42, 160, 134], [126, 196, 92], [236, 214, 96], [250, 236, 190]], float
 )
 """Colours from the ground up to `_TALL_M`."""
+_GREYS = np.array([[30, 34, 42], [128, 132, 138], [250, 250, 246]], float)
+CLASS_COLOURS = {PointClass.GROUND: (138, 122, 100), PointClass.STATIC: (92, 164, 208)}
+_OTHER_COLOUR = (200, 120, 200)
+"""Of classes that a map does not usually hold."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +63,21 @@ def fit_view(low_m: Any, high_m: Any, margin_m: float, longest: int, finest_m: f
     return View(float(low[0]), float(low[1]), int(width), int(height), pixel_m)
 
 
-def draw_map(tiles: Iterable[Tile], view: View) -> NDArray[np.uint8]:
-    """RGB image (height, width, 3) of the tiles; they are read one by one."""
-    top = np.full((view.height, view.width), -np.inf, np.float32)
-    bright = np.zeros((view.height, view.width), np.float32)
+@dataclass(frozen=True)
+class Drawn:
+    """The same view three times, RGB (height, width, 3)."""
+
+    height: NDArray[np.uint8]
+    intensity: NDArray[np.uint8]
+    classes: NDArray[np.uint8]
+
+
+def draw_map(tiles: Iterable[Tile], view: View) -> Drawn:
+    """Images of the tiles, which are read one by one and once."""
+    shape = (view.height, view.width)
+    top = np.full(shape, -np.inf, np.float32)
+    bright, glow = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    kind = np.zeros(shape, np.uint8)
     cell = max(_GROUND_CELL_M, view.pixel_m)
     step = max(round(cell / view.pixel_m), 1)
     cells = (view.height // step + 1, view.width // step + 1)
@@ -70,14 +86,42 @@ def draw_map(tiles: Iterable[Tile], view: View) -> NDArray[np.uint8]:
         left, bottom = tile.offset_m[0] - view.left_m, tile.offset_m[1] - view.bottom_m
         _splat(
             tile.x_m, tile.y_m, tile.z_m, tile.offset_m[2], tile.intensity, tile.class_, int(PointClass.GROUND),
-            left, bottom, view.pixel_m, step, top, bright, low, soil,
+            left, bottom, view.pixel_m, step, top, bright, glow, kind, low, soil,
         )  # fmt: skip
-    if not np.isfinite(top).any():
-        return np.full((view.height, view.width, 3), BACKGROUND, np.uint8)
-    _close_gaps(top, bright)
-    ground = _ground(low, soil, step, top.shape)
-    above = np.where(np.isfinite(top), top - ground, 0.0).astype(np.float32)
-    return _shade(top, above, _stretch(bright, np.isfinite(top)), view.pixel_m)
+    filled = np.isfinite(top)
+    if not filled.any():
+        return Drawn(*(np.full((*shape, 3), BACKGROUND, np.uint8) for _ in range(3)))
+    _close_gaps(top, bright, glow, kind)
+    filled = np.isfinite(top)
+    above = np.where(filled, top - _ground(low, soil, step, shape), 0.0).astype(np.float32)
+    light = _depth_light(top, view.pixel_m)
+    return Drawn(
+        _shade(top, above, _stretch(bright, filled), light),
+        _in_greys(np.where((above < _GROUND_M) & (bright > 0), bright, glow), filled, light),
+        _in_classes(kind, filled, light),
+    )
+
+
+def _in_greys(
+    glow: NDArray[np.float32], filled: NDArray[np.bool_], light: NDArray[np.float32]
+) -> NDArray[np.uint8]:
+    """Intensity: that of the ground where it lies open, else of the highest point."""
+    place = _stretch(glow, filled) * (len(_GREYS) - 1)
+    i = np.minimum(place.astype(np.int64), len(_GREYS) - 2)
+    share = (place - i)[..., None]
+    colour = (_GREYS[i] * (1.0 - share) + _GREYS[i + 1] * share) * (0.4 + 0.6 * light)[..., None]
+    return np.where(filled[..., None], colour, np.array(BACKGROUND)).astype(np.uint8)
+
+
+def _in_classes(
+    kind: NDArray[np.uint8], filled: NDArray[np.bool_], light: NDArray[np.float32]
+) -> NDArray[np.uint8]:
+    """Class of the highest point."""
+    colours = np.tile(np.array(_OTHER_COLOUR, float), (256, 1))
+    for class_, colour in CLASS_COLOURS.items():
+        colours[int(class_)] = colour
+    shaded = colours[kind] * light[..., None]
+    return np.where(filled[..., None], shaded, np.array(BACKGROUND)).astype(np.uint8)
 
 
 def _ground(
@@ -110,9 +154,11 @@ def _stretch(bright: NDArray[np.float32], filled: NDArray[np.bool_]) -> NDArray[
 
 
 def _shade(
-    top: NDArray[np.float32], above: NDArray[np.float32], bright: NDArray[np.float32], pixel_m: float
+    top: NDArray[np.float32],
+    above: NDArray[np.float32],
+    bright: NDArray[np.float32],
+    light: NDArray[np.float32],
 ) -> NDArray[np.uint8]:
-    light = _depth_light(top, pixel_m)
     image = np.empty((*top.shape, 3), np.uint8)
     image[:] = BACKGROUND
     _colour(top, above, bright, light, _RAMP, image)
@@ -132,7 +178,7 @@ def _colour(
             place = min(max(above[y, x] / _TALL_M, 0.0), 1.0) * (len(ramp) - 1)
             i = min(int(place), len(ramp) - 2)
             share = place - i
-            strength = light[y, x] * (0.65 + bright[y, x] if above[y, x] < 0.4 else 1.0)
+            strength = light[y, x] * (0.65 + bright[y, x] if above[y, x] < _GROUND_M else 1.0)
             for c in range(3):
                 value = (ramp[i, c] * (1.0 - share) + ramp[i + 1, c] * share) * strength
                 image[y, x, c] = np.uint8(min(max(value, 0.0), 255.0))
@@ -142,10 +188,11 @@ def _colour(
 def _splat(
     xs: NDArray[np.float32], ys: NDArray[np.float32], zs: NDArray[np.float32], z0: float,
     intensity: NDArray[np.float32], classes: NDArray[np.uint8], ground: int, left: float, bottom: float,
-    pixel_m: float, step: int, top: NDArray[np.float32], bright: NDArray[np.float32], low: NDArray[np.float32],
-    soil: NDArray[np.float64],
+    pixel_m: float, step: int, top: NDArray[np.float32], bright: NDArray[np.float32], glow: NDArray[np.float32],
+    kind: NDArray[np.uint8], low: NDArray[np.float32], soil: NDArray[np.float64],
 ) -> None:  # fmt: skip
-    """Keep per pixel the highest point and the brightest ground; per coarse cell the lowest point and the sum of ground heights."""
+    """Keep per pixel the highest point with its intensity and class, and the brightest ground; per coarse cell the lowest
+    point and the sum of ground heights."""
     height, width = top.shape
     for i in range(len(xs)):
         px = np.int64(np.floor((xs[i] + left) / pixel_m))
@@ -154,7 +201,7 @@ def _splat(
             continue
         z = zs[i] + z0
         if z > top[py, px]:
-            top[py, px] = z
+            top[py, px], glow[py, px], kind[py, px] = z, intensity[i], classes[i]
         if classes[i] == ground:
             bright[py, px] = max(bright[py, px], intensity[i])
             soil[py // step, px // step, 0] += z
@@ -164,7 +211,9 @@ def _splat(
 
 
 @kernel
-def _close_gaps(top: NDArray[np.float32], bright: NDArray[np.float32]) -> None:
+def _close_gaps(
+    top: NDArray[np.float32], bright: NDArray[np.float32], glow: NDArray[np.float32], kind: NDArray[np.uint8]
+) -> None:
     """Fill empty pixels that have three filled neighbours or more with their mean, in place, in one pass."""
     height, width = top.shape
     filled = np.isfinite(top)
@@ -172,13 +221,15 @@ def _close_gaps(top: NDArray[np.float32], bright: NDArray[np.float32]) -> None:
         for x in range(1, width - 1):
             if filled[y, x]:
                 continue
-            count, z, b = 0, 0.0, 0.0
+            count, z, b, g = 0, 0.0, 0.0, 0.0
+            class_ = np.uint8(0)
             for ny in range(y - 1, y + 2):
                 for nx in range(x - 1, x + 2):
                     if filled[ny, nx]:
-                        count, z, b = count + 1, z + top[ny, nx], b + bright[ny, nx]
+                        count, z, b, g = count + 1, z + top[ny, nx], b + bright[ny, nx], g + glow[ny, nx]
+                        class_ = kind[ny, nx]
             if count >= 3:
-                top[y, x], bright[y, x] = z / count, b / count
+                top[y, x], bright[y, x], glow[y, x], kind[y, x] = z / count, b / count, g / count, class_
 
 
 @kernel

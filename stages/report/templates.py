@@ -12,6 +12,8 @@ from scanloom.stages.report.figures import number
 from scanloom.stages.report.overlay import SESSION_COLOURS
 
 FOLDER = Path(__file__).parent
+LAYER_WORDS = {"height": "height", "intensity": "intensity", "classes": "class"}
+"""What the pictures of the map are called."""
 
 
 @lru_cache(maxsize=1)
@@ -26,6 +28,7 @@ def _environment() -> Environment:
     )
     environment.filters["number"] = number
     environment.globals["session_colours"] = SESSION_COLOURS
+    environment.globals["layer_words"] = LAYER_WORDS
     return environment
 
 
@@ -36,4 +39,10 @@ def render(name: str, **values: Any) -> str:
 
 def style() -> str:
     """The style sheet of all pages."""
-    return (FOLDER / "style.css").read_text()
+    return asset("style.css")
+
+
+@lru_cache(maxsize=8)
+def asset(name: str) -> str:
+    """A file of the page as it is. No carriage returns may be in it: a browser would change them and its digest."""
+    return (FOLDER / name).read_text(encoding="utf-8")

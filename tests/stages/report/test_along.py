@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from scanloom.schemas.changes import Changes
+from scanloom.schemas.evaluation import ErrorTrack
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.trajectory import Odometry, Poses
 from scanloom.stages.geometry.factor_rows import fix_rows
 from scanloom.stages.geometry.geodesy import georeference
 from scanloom.stages.geometry.se3 import F8
-from scanloom.stages.report.along import SPARE, FixTrack, blindness, fix_track
+from scanloom.stages.report.along import SPARE, Blindness, FixTrack, blindness, error_chart, fix_track
 from scanloom.stages.report.changed import changed
 from scanloom.stages.report.factor_table import factor_rows
-from scanloom.stages.report.loop_graph import LoopGraph, loop_graph
+from scanloom.stages.report.loop_graph import EDGES, LoopGraph, loop_graph
+from scanloom.stages.report.plots import Plot
+from scanloom.stages.report.ways import Way, ways
 from tests.stages.mapping import fixes_graph, graph_of, loops_of, odometry_of, poses_of, session_of
 
 WORLD = georeference(48.1, 11.6, 520.0).model_dump()
@@ -28,6 +31,18 @@ def road(scans: int = 101, step_m: float = 1.0) -> F8:
     T = np.tile(np.eye(4), (scans, 1, 1))
     T[:, 0, 3] = step_m * np.arange(scans)
     return T
+
+
+def way_of(T: F8) -> Way:
+    return ways({"a": poses_of(T)}, {})["a"]
+
+
+def traces(plot: Plot) -> dict[str, dict[str, Any]]:
+    """By name, the first of each."""
+    found: dict[str, dict[str, Any]] = {}
+    for trace in plot.data:
+        found.setdefault(trace.get("name", ""), trace)
+    return found
 
 
 # --- loops ---
@@ -40,7 +55,8 @@ def drawn_loops(verdicts: list[str], reasons: list[str], **changed: object) -> L
     loops = loops_of(T, [(k, 50 + k) for k in range(n + m)], [0.0] * (n + m))
     accepted = np.arange(n + m) < n
     loops = replace(loops, accepted=accepted, reason=np.array(["passed"] * n + reasons, object), **changed)
-    return loop_graph({"a": poses_of(T), "b": poses_of(T)}, loops, graph_of(loops, verdicts))
+    paths = {"a": poses_of(T), "b": poses_of(T)}
+    return loop_graph(paths, ways(paths, {}), loops, graph_of(loops, verdicts))
 
 
 def test_edges_are_told_apart_by_what_became_of_them() -> None:
@@ -54,8 +70,8 @@ def test_edges_are_told_apart_by_what_became_of_them() -> None:
         "between": 1,
     }
     assert found.used == 2
-    for kind in ("refused", "doubted", "within", "between"):
-        assert found.svg.count(f'class="edge edge-{kind}"') == 1
+    drawn = [trace["name"] for trace in found.plot.data if trace["mode"] == "lines" and trace["showlegend"]]
+    assert sorted(drawn) == sorted(EDGES.values())
     assert [(r.text, r.by, r.count) for r in found.reasons] == [
         ("overlap …", "tests", 2),
         ("too far", "tests", 1),
@@ -64,14 +80,18 @@ def test_edges_are_told_apart_by_what_became_of_them() -> None:
     assert found.other_reasons == 0
 
 
-def test_an_edge_leads_from_one_place_to_the_other() -> None:
-    found = drawn_loops(["used"], [])
-    (edge,) = re.findall(r'd="M([\d.]+) ([\d.]+)L([\d.]+) ([\d.]+)" class="edge', found.svg)
-    (bar,) = re.findall(r'd="M[\d.]+ [\d.]+v8h([\d.]+)v-8" class="bar-line"', found.svg)
-    x_i, y_i, x_j, y_j = map(float, edge)
-    assert y_i == y_j
-    assert found.scale == "20 m"
-    assert (x_j - x_i) / float(bar) == pytest.approx(50 / 20, rel=1e-3)
+def test_an_edge_leads_from_one_place_to_the_other_and_tells_of_both() -> None:
+    found = drawn_loops(["used"], ["overlap <0.2>"])
+    line = traces(found.plot)["in use"]
+    assert line["x"] == [0.0, 50.0, None]
+    assert line["y"] == [0.0, 0.0, None]
+    dots = [trace for trace in found.plot.data if trace["mode"] == "markers"]
+    assert dots[1]["text"][0] == "scans 0 and 50, rmse 0.05 m, overlap 80 %"
+    assert dots[0]["text"][0].endswith("overlap &lt;0.2&gt;")
+    assert [(pair.scans, pair.outcome) for pair in found.pairs] == [
+        ("scans 0 and 50", "in use"),
+        ("scans 1 and 51", "overlap <0.2>"),
+    ]
 
 
 def test_reasons_beyond_the_first_few_are_counted_together() -> None:
@@ -84,21 +104,26 @@ def test_reasons_beyond_the_first_few_are_counted_together() -> None:
 def test_thousands_of_edges_stay_a_small_picture() -> None:
     T = road(6000, 0.1)
     loops = loops_of(T, [(k, 3000 + k) for k in range(3000)], [0.0] * 3000)
-    found = loop_graph({"a": poses_of(T)}, loops, graph_of(loops))
+    paths = {"a": poses_of(T)}
+    found = loop_graph(paths, ways(paths, {}), loops, graph_of(loops))
     assert found.used == 3000
-    assert 300 <= found.svg.count("L") <= 600
-    assert len(found.svg) < 120_000
+    assert 3 * 300 <= len(traces(found.plot)["in use"]["x"]) <= 3 * 600
+    assert len(found.plot.json) < 250_000
+    assert len(found.pairs) == 60
 
 
 def test_no_loops_and_loops_without_poses_draw_nothing() -> None:
     T = road()
-    assert loop_graph({"a": poses_of(T)}, Loops.empty(), Graph.empty()) == LoopGraph("", "", [], [], 0)
+    paths = {"a": poses_of(T)}
+    nothing = loop_graph(paths, ways(paths, {}), Loops.empty(), Graph.empty())
+    assert not nothing.plot
+    assert (nothing.edges, nothing.reasons, nothing.pairs) == ([], [], [])
     loops = loops_of(T, [(0, 50)], [0.0], session="elsewhere")
-    found = loop_graph({"a": poses_of(T)}, loops, graph_of(loops))
-    assert found.svg == ""
+    found = loop_graph(paths, ways(paths, {}), loops, graph_of(loops))
+    assert not found.plot
     assert found.used == 1
-    nowhere = Poses.empty(frame="map", georeference=None)
-    assert loop_graph({"elsewhere": nowhere}, loops, graph_of(loops)).svg == ""
+    nowhere = {"elsewhere": Poses.empty(frame="map", georeference=None)}
+    assert not loop_graph(nowhere, ways(nowhere, {}), loops, graph_of(loops)).plot
 
 
 # --- GNSS ---
@@ -107,7 +132,7 @@ def test_no_loops_and_loops_without_poses_draw_nothing() -> None:
 def track_of(off_m: F8, verdicts: list[str], georeference: dict[str, object] | None = WORLD) -> FixTrack:
     T = road(len(off_m))
     graph = fixes_graph(T[:, :3, 3] + np.nan_to_num(off_m), -off_m, verdicts)
-    return fix_track(fix_rows(graph)["a"], poses_of(T, georeference=georeference))
+    return fix_track("a", fix_rows(graph)["a"], way_of(T), georeference is not None)
 
 
 def test_fixes_are_coloured_by_what_became_of_them() -> None:
@@ -129,10 +154,11 @@ def test_fixes_are_coloured_by_what_became_of_them() -> None:
         ("switched off: chi-square …", 1, "off"),
         ("receiver reports no fix", 1, "none"),
     ]
-    # Five decades of which the first is 1 mm: 1 cm is a quarter of the height, at the bottom of the picture.
-    assert 'd="M0.0 150.0h0" class="dots dots-used"' in found.chart
-    assert 'd="M400.0 50.0h0M600.0 0.0h0" class="dots dots-gate"' in found.chart
-    assert 'd="M800.0 0.0h0" class="dots dots-off"' in found.chart
+    dots = traces(found.plot)
+    assert (dots["used"]["x"], dots["used"]["y"]) == ([0.0], [0.01])
+    assert (dots["left out by a test"]["x"], dots["left out by a test"]["y"]) == ([2.0, 3.0], [1.0, 10.0])
+    assert dots["switched off: contradicts the rest of the graph"]["x"] == [4.0]
+    assert dots["used"]["customdata"] == [[0, 1_700_000_000.0]]
 
 
 def test_stretches_without_a_position_are_marked() -> None:
@@ -144,25 +170,28 @@ def test_stretches_without_a_position_are_marked() -> None:
     residual = graph.residual_m.copy()
     residual[4:7] = np.nan
     rows = fix_rows(replace(graph, measurement=measurement, residual_m=residual))["a"]
-    drawn = fix_track(rows, poses_of(T, georeference=WORLD)).chart
-    assert 'd="M300.0 0H600.0V200H300.0z" class="band band-quiet"' in drawn
+    (band,) = fix_track("a", rows, way_of(T), True).plot.layout["shapes"]
+    assert (band["x0"], band["x1"], band["fillcolor"]) == (3.0, 6.0, "--band-quiet")
 
 
 def test_without_a_georeference_verdicts_are_listed_and_nothing_is_drawn() -> None:
     found = track_of(np.ones((4, 3)), ["too few good fixes"] * 4, None)
-    assert found.chart == ""
+    assert not found.plot
     assert found.verdicts[0].count == 4
 
 
 def test_fixes_on_the_other_side_of_the_earth_have_their_place() -> None:
-    drawn = track_of(np.full((3, 3), 9e6), ["used", "off", "off"]).chart
-    assert "1e+07" in drawn
-    assert "nan" not in drawn
+    drawn = track_of(np.full((3, 3), 9e6), ["used", "off", "off"]).plot
+    low, high = drawn.layout["yaxis"]["range"]
+    assert low < np.log10(9e6 * np.sqrt(2)) < high
+    assert "NaN" not in drawn.json
 
 
 def test_hours_of_fixes_stay_a_small_picture() -> None:
     off = np.abs(np.random.default_rng(0).normal(size=(40_000, 3)))
-    assert len(track_of(off, ["used", SPARE, "lies", "switched off"] * 10_000).chart) < 60_000
+    drawn = track_of(off, ["used", SPARE, "lies", "switched off"] * 10_000).plot
+    assert [len(trace["x"]) for trace in drawn.data] == [2000] * 4
+    assert len(drawn.json) < 400_000
 
 
 # --- degeneracy ---
@@ -175,36 +204,56 @@ def blind_road(scans: int = 101) -> Odometry:
     return replace(odometry_of(road(scans)), direction_p=p)
 
 
+def blind_of(odometry: Odometry) -> Blindness:
+    return blindness("a", odometry, session_of(), way_of(road(max(len(odometry), 1))))
+
+
 def test_blind_stretches_are_marked_and_named() -> None:
-    found = blindness(blind_road(), session_of())
+    found = blind_of(blind_road())
     assert found.share == pytest.approx(30 / 101)
     assert found.longest_m == pytest.approx(30.0)
-    assert "M200.0 0H500.0V200" in found.chart
-    rows = found.chart.split('<span class="row">')[1:]
-    assert [row.split("<")[0] for row in rows] == ["along", "across", "up", "turn"]
-    assert "M200.0 0H400.0V10" in rows[0]
-    assert "strip-blind" not in rows[1] + rows[2]
-    assert "M300.0 0H500.0V10" in rows[3]
+    (band,) = found.plot.layout["shapes"]
+    assert (band["x0"], band["x1"]) == (20.0, 50.0)
+    assert found.plot.layout["yaxis2"]["ticktext"] == ["along", "across", "up", "turn"]
+    rows = [trace["x"] for trace in found.plot.data if trace.get("yaxis") == "y2"]
+    assert rows == [[20.0, 40.0, None], [], [], [30.0, 50.0, None]]
 
 
 def test_a_way_that_was_seen_has_a_curve_and_no_bands() -> None:
-    found = blindness(odometry_of(road()), session_of())
+    found = blind_of(odometry_of(road()))
     assert found.share == found.longest_m == 0.0
-    assert "curve-1" in found.chart
-    assert "band" not in found.chart
+    assert [trace["mode"] for trace in found.plot.data] == ["lines"]
+    assert found.plot.layout["shapes"] == []
+    assert "yaxis2" not in found.plot.layout
 
 
 @pytest.mark.parametrize("scans", [0, 1])
 def test_no_way_has_no_chart(scans: int) -> None:
-    assert blindness(odometry_of(road(scans)), session_of()).chart == ""
+    assert not blind_of(odometry_of(road(scans))).plot
 
 
 def test_scans_without_e1_leave_a_gap_and_all_of_them_no_chart() -> None:
     odometry = odometry_of(road())
     e1 = odometry.degeneracy_e.copy()
     e1[10:20] = np.nan
-    assert "nan" not in blindness(replace(odometry, degeneracy_e=e1), session_of()).chart
-    assert blindness(replace(odometry, degeneracy_e=np.full(101, np.nan)), session_of()).chart == ""
+    drawn = blind_of(replace(odometry, degeneracy_e=e1)).plot.data[0]
+    assert [k for k, v in enumerate(drawn["y"]) if v is None] == list(range(9, 19))
+    assert not blind_of(replace(odometry, degeneracy_e=np.full(101, np.nan))).plot
+
+
+# --- errors ---
+
+
+def test_errors_lie_where_their_scans_were() -> None:
+    T = road(11, 2.0)
+    stamps = poses_of(T).stamp_ns[3:6]
+    track = ErrorTrack(
+        stamp_ns=stamps, travelled_m=np.arange(3.0), odometry_error_m=np.array([1.0, 2.0, 3.0]), fusion_error_m=np.full(3, 0.5)
+    )  # fmt: skip
+    odometry, fused = error_chart("a", track, way_of(T)).data
+    assert odometry["x"] == fused["x"] == [6.0, 8.0, 10.0]
+    assert odometry["y"] == [1.0, 2.0, 3.0]
+    assert [scan for scan, _ in fused["customdata"]] == [3, 4, 5]
 
 
 # --- pose graph ---
@@ -238,29 +287,30 @@ def changes_of(objects: list[tuple[float, float, int]], sessions: tuple[str, ...
 
 
 def test_what_is_gone_is_listed_the_largest_first_and_drawn() -> None:
-    found = changed({"a": poses_of(road())}, changes_of([(10.0, 5.0, 40), (60.0, -5.0, 90)]))
+    found = changed({"a": way_of(road())}, changes_of([(10.0, 5.0, 40), (60.0, -5.0, 90)]))
     assert found is not None
     assert (found.objects, found.points) == (2, 130)
     assert [gone.points for gone in found.listed] == [90, 40]
     assert found.listed[0].middle_m == pytest.approx((60.0, -5.0, 0.0), abs=0.1)
     assert found.listed[0].size_m == pytest.approx((1.0, 1.0, 1.0), abs=0.1)
     assert found.listed[0].through == 7
-    assert found.svg.count("h0") == 2
+    assert found.plot.data[-1]["x"] == pytest.approx([60.0, 10.0], abs=0.1)
 
 
 def test_more_objects_than_a_list_has_room_for_are_all_drawn() -> None:
-    found = changed({"a": poses_of(road())}, changes_of([(5.0 * k, 3.0, 10) for k in range(20)]))
+    found = changed({"a": way_of(road())}, changes_of([(5.0 * k, 3.0, 10) for k in range(20)]))
     assert found is not None
     assert len(found.listed) == 12
-    assert found.svg.count("h0") == 20
+    assert len(found.plot.data[-1]["x"]) == 20
 
 
 def test_nothing_gone_and_nothing_extended_are_two_things() -> None:
-    paths = {"a": poses_of(road())}
+    paths = {"a": way_of(road())}
     assert changed(paths, None) is None
     assert changed(paths, changes_of([], ())) is None
     looked = changed(paths, changes_of([]))
     assert looked is not None
-    assert (looked.objects, looked.svg, looked.listed) == (0, "", [])
-    nowhere = Poses.empty(frame="map", georeference=None)
-    assert getattr(changed({"a": nowhere}, changes_of([(1.0, 1.0, 9)])), "svg", None) == ""
+    assert (looked.objects, bool(looked.plot), looked.listed) == (0, False, [])
+    nowhere = changed({}, changes_of([(1.0, 1.0, 9)]))
+    assert nowhere is not None
+    assert not nowhere.plot

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
-from scanloom.stages.report.charts import (
-    Bands,
-    Curve,
-    Dots,
-    Strip,
-    chart,
-    exact,
-    line_chart,
-    linear,
-    logarithmic,
-    nice_top,
-    thin,
-    ticks,
-)
 from scanloom.stages.report.figures import number
 from scanloom.stages.report.overlay import round_length
+from scanloom.stages.report.plots import (
+    bands,
+    logarithmic,
+    merged,
+    plain,
+    rows_of,
+    script_json,
+    short,
+    thin,
+    upwards,
+)
 from scanloom.stages.report.raster import fit_view
 
 
@@ -44,29 +43,29 @@ def test_lengths_are_round(about: float, want: float) -> None:
     assert round_length(about) == pytest.approx(want)
 
 
-@pytest.mark.parametrize("high", [0.03, 0.7, 1.0, 3.9, 12.0, 99.0, 1013.0])
-def test_ticks_are_few_and_reach_the_top(high: float) -> None:
-    values = ticks(high)
-    assert 3 <= len(values) <= 11
-    assert values[0] == 0
-    assert values[-1] <= high * 1.001
-    assert high * 0.999 <= nice_top(high) <= high * 1.5
+def test_thinning_keeps_every_peak_and_every_dip() -> None:
+    y = np.zeros(36_000)
+    y[4321], y[20_000], y[20_001] = 7.0, -3.0, 9.0
+    rows = thin(y)
+    assert len(rows) <= 2000
+    assert {4321, 20_000, 20_001} <= set(rows.tolist())
+    assert (np.diff(rows) > 0).all()
 
 
-def test_thinning_keeps_every_peak() -> None:
-    y = np.zeros(10_000)
-    y[4321] = 7.0
-    x_thin, y_thin = thin(np.arange(10_000.0), y)
-    assert len(x_thin) <= 500
-    assert y_thin.max() == 7.0
-    assert x_thin[np.argmax(y_thin)] == 4321
+@pytest.mark.parametrize("count", [0, 1, 2000])
+def test_short_curves_are_whole(count: int) -> None:
+    assert thin(np.zeros(count)).tolist() == list(range(count))
 
 
-def test_charts_of_nothing_and_of_zero() -> None:
-    assert line_chart([], "x", "y") == ""
-    flat = line_chart([Curve("flat", np.zeros(1), np.zeros(1), 1)], "x", "y")
-    assert "nan" not in flat
-    assert flat.startswith("<figure")
+def test_thinning_skips_what_is_unknown_and_keeps_a_long_gap() -> None:
+    y = np.random.default_rng(0).normal(size=9000)
+    y[::2] = np.nan
+    y[4000:6000] = np.nan
+    rows = thin(y)
+    kept = np.isfinite(y[rows])
+    assert kept[(rows < 3990) | (rows > 6010)].all()
+    assert not kept[(rows >= 4010) & (rows < 5990)].any()
+    assert y[rows][kept].max() == np.nanmax(y)
 
 
 def test_numbers_are_short() -> None:
@@ -76,62 +75,51 @@ def test_numbers_are_short() -> None:
     assert number(float("nan")) == "–"
 
 
-def test_thinning_is_that_of_a_plain_loop() -> None:
-    y = np.random.default_rng(0).normal(size=1777)
-    x_thin, y_thin = thin(np.arange(1777.0), y)
-    groups = np.split(np.arange(1777), np.linspace(0, 1777, 501).astype(int)[1:-1])
-    assert x_thin.tolist() == [float(group[np.argmax(y[group])]) for group in groups]
-    assert np.array_equal(y_thin, y[x_thin.astype(int)])
-
-
 @pytest.mark.parametrize(
-    ("low", "high", "want"),
-    [
-        (0.001, 0.0, [0.001, 0.01]),
-        (0.001, 5.0, [0.001, 0.01, 0.1, 1, 10]),
-        (0.01, 0.1, [0.01, 0.1]),
-        (1.0, 1.1e7, [1, 1e2, 1e4, 1e6, 1e8]),
-    ],
+    ("values", "low", "high"), [([0.001, 5.0], 0.001, 5.0), ([0.0, 1.0], 0.001, 1.0), ([2.0], 2.0, 2.0)]
 )
-def test_decades_cover_every_value_and_are_few(low: float, high: float, want: list[float]) -> None:
-    axis = logarithmic(low, high)
-    assert list(axis.ticks) == pytest.approx(want)
-    assert axis.high >= high
-    assert len(axis.ticks) <= 7
+def test_logarithmic_axes_show_every_value(values: list[float], low: float, high: float) -> None:
+    axis = logarithmic("y", np.array([*values, np.nan]), 0.001)
+    a, b = axis["range"]
+    assert a < np.log10(low)
+    assert b > np.log10(high)
+    assert b - a >= 1.2
 
 
-def test_shares_are_those_of_the_axis_and_stay_on_it() -> None:
-    axis = logarithmic(0.01, 100.0)
-    assert axis.share(np.array([0.01, 1.0, 100.0, 0.0, -5.0, 1e9])).tolist() == pytest.approx(
-        [0, 0.5, 1, 0, 0, 1]
-    )
-    assert linear(9.0).share(np.array([0.0, 5.0])).tolist() == [0.0, 0.5]
-    assert exact(0.0).share(np.array([0.0])).tolist() == [0.0]
-
-
-def test_dots_stand_where_their_values_are() -> None:
-    drawn = Dots("fixes", np.array([25.0, 100.0]), np.array([1.0, 0.1]), "used").draw(
-        exact(100.0), logarithmic(0.01, 1.0)
-    )
-    assert 'd="M250.0 0.0h0M1000.0 100.0h0"' in drawn
+def test_axes_from_zero_show_every_value_and_are_never_empty() -> None:
+    assert upwards("y", np.array([1.0, np.nan, 3.0]))["range"] == [0, pytest.approx(3.18)]
+    assert upwards("y", np.zeros(3))["range"] == [0, 1.0]
+    assert upwards("y", np.empty(0))["range"] == [0, 1.0]
 
 
 def test_bands_are_merged_where_nobody_could_tell_them_apart_and_never_vanish() -> None:
-    x_axis = exact(1000.0)
     ranges = np.array([[100.0, 100.0], [400.0, 420.0], [420.5, 450.0], [470.0, 480.0]])
-    drawn = Bands("blind", ranges, "blind").draw(x_axis, linear(1.0))
-    assert "M100.0 0H101.5V" in drawn
-    assert "M400.0 0H450.0V" in drawn
-    assert drawn.count("z") == 3
+    assert [(b["x0"], b["x1"]) for b in bands(ranges, "--band", 1000.0)] == [
+        (100.0, pytest.approx(101.67)), (400.0, 450.0), (470.0, 480.0)
+    ]  # fmt: skip
     crowd = np.column_stack((np.arange(0.0, 1000.0, 0.1), np.arange(0.0, 1000.0, 0.1) + 0.05))
-    assert Bands("blind", crowd, "blind").draw(x_axis, linear(1.0)).count("z") == 1
-    assert Bands("blind", np.empty((0, 2)), "blind").draw(x_axis, linear(1.0)) == ""
+    assert len(merged(crowd, 1000.0)) == 1
+    assert bands(np.empty((0, 2)), "--band", 1000.0) == []
 
 
-def test_a_chart_has_labels_of_both_axes_and_rows_below() -> None:
-    strips = [Strip("along", np.array([[0.0, 5.0]]), "blind"), Strip("<up>", np.empty((0, 2)), "blind")]
-    drawn = chart([], exact(10.0), linear(1.0), "way & time", "error, m", strips)
-    assert drawn.count("<svg") == 3
-    assert "way &amp; time" in drawn
-    assert "&lt;up&gt;" in drawn
-    assert drawn.count("left:") == len(ticks(10.0))
+def test_rows_have_a_label_each_and_gaps_between_their_stretches() -> None:
+    traces, below = rows_of(
+        ["along", "<up>"], [np.array([[0.0, 5.0], [7.0, 9.0]]), np.empty((0, 2))], "--c", 10.0
+    )
+    assert traces[0]["x"] == [0.0, 5.0, None, 7.0, 9.0, None]
+    assert traces[0]["y"] == [0, 0, None, 0, 0, None]
+    assert traces[1]["x"] == []
+    assert below["ticktext"] == ["along", "&lt;up&gt;"]
+
+
+def test_values_are_short_and_gaps_are_null() -> None:
+    assert short(np.array([1.23456789, np.nan, np.inf, 12345678.0])) == [1.235, None, None, 12350000.0]
+    assert plain("a<b> & %{x}") == "a&lt;b&gt; &amp; %\u200b{x}"
+
+
+def test_nothing_in_a_script_element_ends_it() -> None:
+    text = script_json({"a": "</script><!-- \u2028 & é"})
+    assert not set("<>&\u2028é") & set(text)
+    assert json.loads(text) == {"a": "</script><!-- \u2028 & é"}
+    with pytest.raises(ValueError, match="JSON"):
+        script_json(float("nan"))

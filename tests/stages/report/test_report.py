@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import html
 import io
+import json
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -26,6 +31,7 @@ from scanloom.stages.report import picture, report
 from scanloom.stages.report.map_picture import Settings as PictureSettings
 from scanloom.stages.report.page import compose, run_section
 from scanloom.stages.report.stage import Settings
+from scanloom.stages.report.templates import asset
 from scanloom.stages.tiling import overview
 from scanloom.stages.tiling.overview import Settings as OverviewSettings
 from tests.stages.mapping import (
@@ -90,17 +96,74 @@ def body(files: ReportFiles) -> str:
 def test_the_same_map_gives_the_same_bytes(street_map: Map) -> None:
     one_, drawn = street_map.report(), street_map.drawn
     assert one_.read("body.html") == street_map.report().read("body.html")
-    assert drawn.read("preview.png") == street_map.drawn.read("preview.png")
+    for name in drawn.contents:
+        assert drawn.read(name) == street_map.drawn.read(name)
 
 
 def test_the_page_is_one_file_without_outside_references(street_map: Map) -> None:
     page = compose(body(street_map.report()), run_section([], {}), "street")
     parser = parse(page)
+    assert parser.addresses
     assert all(address.startswith("data:") for address in parser.addresses)
-    assert "@import" not in page
-    assert "url(" not in page
-    assert "<script" not in page
-    assert 20_000 < len(page) < 1_000_000
+    own = page.replace(asset("vendor/plotly-basic.min.js"), "")
+    assert "@import" not in own
+    assert "url(" not in own
+    assert set(re.findall(r"https?://[^\"'\s<]+", own)) <= {"http://www.w3.org/2000/svg"}
+    assert 20_000 < len(own) < 1_000_000
+    assert len(page) < 2_500_000
+
+
+def test_scripts_of_the_page_are_those_its_policy_names(street_map: Map) -> None:
+    page = compose(body(street_map.report()), run_section([], {}), "street")
+    policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]+)"', page)
+    assert policy is not None
+    told = html.unescape(policy[1])
+    assert told.startswith("default-src 'none'; ")
+    scripts = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
+    assert len(scripts) == 2
+    for script in scripts:
+        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        assert f"'sha256-{digest}'" in told
+    assert "unsafe-eval" not in told
+    assert told.count("'unsafe-inline'") == 1
+    assert "script-src 'sha256" in told
+
+
+def test_every_plot_is_valid_json(street_map: Map) -> None:
+    loops = loops_of(street_map.T, [(0, 4), (1, 4)], [0.0, 0.0])
+    plots = plots_of(body(street_map.report(loops=loops, changes=changes_of([(10.0, 5.0, 9)]))))
+    assert [plot["kind"] for plot in plots] == ["plan", "along", "along", "plan", "plan"]
+    for plot in plots:
+        assert plot["data"]
+        for trace in plot["data"]:
+            assert len(trace["x"]) == len(trace["y"])
+
+
+def plots_of(page: str) -> list[dict[str, Any]]:
+    return [json.loads(text) for text in re.findall(r'<script type="application/json">(.*?)</script>', page)]
+
+
+HOSTILE = "</script><img src=x onerror=alert(1)><!--\u2028"
+
+
+def test_hostile_names_of_sessions_reach_neither_tags_nor_scripts(street_map: Map) -> None:
+    names = [HOSTILE, "b"]
+    sessions: Parts[Session] = Parts([((("session", n),), session_of(n, 5)) for n in names])
+    poses: Parts[Poses] = Parts([((("session", n),), poses_of(street_map.T)) for n in names])
+    odometry = Parts([((("session", n),), odometry_of(street_map.T)) for n in names])
+    loops = replace(loops_of(street_map.T, [(0, 4)], [0.0]), session_i=np.array([HOSTILE], object))
+    loops = replace(loops, session_j=np.array(["b"], object))
+    given = {"session": sessions, "poses": poses, "odometry": odometry, "loops": loops}
+    page = body(street_map.report(**given, metrics=Metrics.empty(), error_track=Parts([])))
+    assert "<img src=x" not in page
+    assert "<!--" not in page
+    assert page.count("</script>") == page.count("<script type=")
+    parse(page)
+    tracks = plots_of(page)[0]
+    assert set(tracks["beads"]) == set(names)
+    shown = [trace["name"] for trace in tracks["data"]]
+    assert not any("<" in name for name in shown)
+    assert html.unescape(shown[0]) == HOSTILE
 
 
 def test_a_good_map_is_called_good_and_says_why(street_map: Map) -> None:
@@ -162,9 +225,9 @@ def test_problems_of_the_log_reach_the_page_and_are_escaped(street_map: Map) -> 
     problem = Problem(code="imu.gap", severity="error", text="silent for <b>2 s</b>", topic="/imu")
     session = session_of("a", 5, topics=(topic,), problems=(problem,), complete=False)
     page = compose(body(street_map.report(session=one(session))), run_section([], {"<i>": "<u>"}), "<title>")
-    assert "<script>" not in page
+    assert "<script>alert" not in page
     assert "<b>2 s" not in page
-    assert "<i>" not in page
+    assert "<dt><i>" not in page
     text = parse(page).text
     assert "Fair" in text
     assert "silent for <b>2 s</b>" in text
@@ -193,7 +256,8 @@ def test_two_sessions_have_two_colours_and_two_tables(street_map: Map) -> None:
     poses: Parts[Poses] = Parts([((("session", n),), poses_of(T)) for n, T in both.items()])
     files = street_map.report(session=sessions, poses=poses)
     page = body(files)
-    assert page.count("<polyline") >= 4
+    assert len(plots_of(page)[0]["beads"]) == 2
+    assert page.count("<polyline") == 6
     parse(page)
 
 

@@ -1,0 +1,73 @@
+"""The way of each session: where each scan was, how far it had driven, and what was known of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from scanloom.schemas.trajectory import Odometry, Poses
+from scanloom.stages.geometry.alignment import travelled
+from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.report.plots import I8, Trace, fixed, short, thin
+
+DRIVEN = "distance driven, m"
+
+
+@dataclass(frozen=True)
+class Way:
+    """Scans of a session in order: numbers (n,), stamps (n,), metres driven (n,), places (n, 3)."""
+
+    scan_index: I8
+    stamp_ns: I8
+    driven_m: F8
+    place_m: F8
+
+    def __len__(self) -> int:
+        return len(self.scan_index)
+
+    @property
+    def length_m(self) -> float:
+        return float(self.driven_m[-1]) if len(self) else 0.0
+
+    def at_scans(self, scans: I8) -> I8:
+        """Rows of scans (n,), by number; the next one where a scan has no pose."""
+        return np.clip(np.searchsorted(self.scan_index, scans), 0, max(len(self) - 1, 0))
+
+    def at_stamps(self, stamps_ns: I8) -> I8:
+        """Rows of the scans (n,) at these times, or the first after."""
+        return np.clip(np.searchsorted(self.stamp_ns, stamps_ns), 0, max(len(self) - 1, 0))
+
+    def told(self, rows: I8) -> list[list[Any]]:
+        """Number and stamp, s, of scans, as each point of a curve carries them."""
+        seconds = fixed(self.stamp_ns[rows] * 1e-9, 2)
+        return [list(pair) for pair in zip(self.scan_index[rows].tolist(), seconds)]
+
+
+def ways(poses: Mapping[str, Poses], odometries: Mapping[str, Odometry]) -> dict[str, Way]:
+    """By the map's poses; by odometry for sessions that have none."""
+    found = {name: _way(rows, rows.T_world_lidar) for name, rows in poses.items() if len(rows)}
+    for name, rows in odometries.items():
+        if name not in found and len(rows):
+            found[name] = _way(rows, rows.T_odom_lidar)
+    return dict(sorted(found.items()))
+
+
+def _way(rows: Poses | Odometry, T: F8) -> Way:
+    return Way(rows.scan_index, rows.stamp_ns, travelled(T), T[:, :3, 3])
+
+
+HOVER = "%{y:.3~g} UNIT<br>%{x:.1f} m driven, scan %{customdata[0]}<br>stamp %{customdata[1]:.2f} s<extra></extra>"
+
+
+def curve(label: str, way: Way, rows: I8, y: F8, colour: str, unit: str, **more: Any) -> Trace:
+    """Values y (n,) of scans of a way, thinned; hovering tells distance, scan and stamp."""
+    kept = thin(y)
+    at = rows[kept]
+    return {
+        "type": "scatter", "mode": "lines", "name": label, "x": fixed(way.driven_m[at]), "y": short(y[kept]),
+        "customdata": way.told(at), "line": {"color": colour, "width": 1.6}, "hovertemplate": HOVER.replace("UNIT", unit),
+        "showlegend": True, **more,
+    }  # fmt: skip
