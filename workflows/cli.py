@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
-from scanloom.schemas.errors import EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_OK, ScanloomError
+from scanloom.schemas.errors import EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_OK, ScanloomError, UsageError
 
 app = typer.Typer(
     name="scanloom",
@@ -37,6 +37,10 @@ ClusterOption = Annotated[
 ]
 WorkersOption = Annotated[
     int | None, typer.Option("--workers", min=1, help="Local processes (default: one per core).")
+]
+ExportOption = Annotated[
+    str,
+    typer.Option("--export", help="Formats to export the map to as well, separated by commas, as laz,copc."),
 ]
 ProjectOption = Annotated[
     Path | None, typer.Option("--project", help="Settings file (default ./scanloom.yaml when present).")
@@ -133,6 +137,7 @@ def map_command(
     workers: WorkersOption = None,
     settings: SetOption = None,
     project: ProjectOption = None,
+    export_to: ExportOption = "",
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would run and why; compute nothing.")
     ] = False,
@@ -140,6 +145,7 @@ def map_command(
 ) -> None:
     """Logs into a map: trajectory, tiles, metrics and a report."""
     _start_workers(cluster, idle=dry_run)
+    _check_formats(export_to)
     from scanloom.pipeline.progress import progress_for
     from scanloom.workflows.build_map import Order, build_map, plan_map
     from scanloom.workflows.configuration import command_line_settings, project_settings
@@ -161,7 +167,8 @@ def map_command(
         _show_plan(*plan_map(order), as_json)
         return
     outcome = build_map(order, progress_for(sys.stderr))
-    _show_outcome(outcome, as_json)
+    exported = _export_after(outcome, export_to)
+    _show_outcome(outcome, exported, as_json)
     raise typer.Exit(outcome.exit_code)
 
 
@@ -187,6 +194,7 @@ def extend(
     workers: WorkersOption = None,
     settings: SetOption = None,
     project: ProjectOption = None,
+    export_to: ExportOption = "",
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would run and why; compute nothing.")
     ] = False,
@@ -194,6 +202,7 @@ def extend(
 ) -> None:
     """Add sessions to a finished map: a new version beside it, with what has changed since."""
     _start_workers(cluster, idle=dry_run)
+    _check_formats(export_to)
     from scanloom.pipeline.progress import progress_for
     from scanloom.workflows.build_map import build_map, plan_map
     from scanloom.workflows.configuration import command_line_settings, project_settings
@@ -217,7 +226,8 @@ def extend(
         _show_plan(*plan_map(order), as_json)
         return
     outcome = build_map(order, progress_for(sys.stderr))
-    _show_outcome(outcome, as_json)
+    exported = _export_after(outcome, export_to)
+    _show_outcome(outcome, exported, as_json)
     raise typer.Exit(outcome.exit_code)
 
 
@@ -236,7 +246,23 @@ def _show_plan(tasks: list[Any], errors: list[tuple[str, ScanloomError]], as_jso
         raise typer.Exit(errors[0][1].exit_code)
 
 
-def _show_outcome(outcome: Any, as_json: bool) -> None:
+def _check_formats(names: str) -> None:
+    """Before hours of mapping, whether what is to follow can be done."""
+    if names:
+        from scanloom.workflows.export_map import formats_of
+
+        formats_of(names)
+
+
+def _export_after(outcome: Any, names: str) -> list[Any]:
+    if not names or not outcome.delivered:
+        return []
+    from scanloom.workflows.export_map import export_map, options_of
+
+    return export_map(outcome.out, names, options_of())
+
+
+def _show_outcome(outcome: Any, exported: list[Any], as_json: bool) -> None:
     for text in outcome.warnings:
         _say(f"warning: {text}")
     for _, error in outcome.failures:
@@ -249,6 +275,7 @@ def _show_outcome(outcome: Any, as_json: bool) -> None:
                 "executed": outcome.executed,
                 "metrics": outcome.metrics,
                 "warnings": outcome.warnings,
+                "exports": [entry.as_json() for entry in exported],
                 "failures": [{"where": place, "error": str(error)} for place, error in outcome.failures],
             }
         )
@@ -257,6 +284,9 @@ def _show_outcome(outcome: Any, as_json: bool) -> None:
         for row in outcome.metrics:
             if row["name"] in HEADLINE:
                 print(f"{row['name']:36} {row['value']:12.4g} {row['unit']}")
+    if not as_json:
+        for entry in exported:
+            print(entry.text())
 
 
 HEADLINE = {
@@ -328,7 +358,7 @@ def nightly(
     night = run_fleet(
         fleet, out, _store_folder(store), cluster=cluster, workers=workers, progress=progress_for(sys.stderr)
     )
-    for row in night.failures:
+    for row in night.failures + night.regressions:
         _say(f"scanloom: {row}")
     if as_json:
         _emit(night.summary)
@@ -375,7 +405,9 @@ def compare(
 
 @app.command()
 def export(
-    folder: Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a finished map.")],
+    folder: Annotated[
+        Path | None, typer.Argument(metavar="MAP", help="Folder of a finished map.", show_default=False)
+    ] = None,
     formats: Annotated[
         str,
         typer.Option("--format", help="Formats, separated by commas; `scanloom export --list` names them."),
@@ -418,6 +450,8 @@ def export(
         rows = known_formats()
         _emit(rows) if as_json else print("\n".join(f"{row['format']:11} {row['doc']}" for row in rows))
         return
+    if folder is None:
+        raise UsageError("no map is named", next_step="scanloom export MAP --format laz,copc")
     options = options_of(
         epsg=epsg,
         heights=heights.value,

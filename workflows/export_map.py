@@ -80,7 +80,7 @@ def export_map(folder: Path, names: str, options: Options, out: Path | None = No
     UsageError : a format or option does not exist, or its library is not installed.
     StoreError : the folder of the exports cannot be written.
     """
-    formats = chosen([name.strip().lower() for name in names.split(",") if name.strip()])
+    formats = formats_of(names)
     source = MapSource.open(folder)
     Projector.of(source, options)
     place = out or folder / "exports"
@@ -91,6 +91,16 @@ def export_map(folder: Path, names: str, options: Options, out: Path | None = No
 def _order(entry: Format) -> bool:
     """What lists the other exports comes after them."""
     return entry.lists_others
+
+
+def formats_of(names: str) -> list[Format]:
+    """Formats separated by commas.
+
+    Raises
+    ------
+    UsageError : a name that no format has, or a format whose library is not installed.
+    """
+    return chosen([name.strip().lower() for name in names.split(",") if name.strip()])
 
 
 def known_formats() -> list[Row]:
