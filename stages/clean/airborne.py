@@ -56,6 +56,8 @@ BRIGHT, SAMPLED, LEAST_BRIGHT = 0.8, 8, 50
 nothing."""
 ROUNDED = 0.01
 """When more than this share of what stands has the very lowest intensity, that tells nothing."""
+LEAST_ODDS = (0.0, -0.5)
+"""Log-odds of each round from which on a return is in the air. In the end a missed particle costs more than a lost leaf."""
 BESIDE, ABOVE = 4, 3
 """Cells of the image to each side, and upwards and downwards, that lie around."""
 
@@ -113,8 +115,8 @@ def airborne(scan: DeskewedScan, known: Known, apart_m: float) -> B1:
     out = np.zeros(len(scan), np.bool_)
     taken, asked = TAKEN[known.said, known.classes], np.flatnonzero(may_fly(known.classes, known.said))
     thing, strength = things(scan, known, apart_m), strengths(scan, known, asked)
-    for table in weights.ROUNDS:
-        fly = added(evidence(scan, known, thing, strength, taken, asked), table) > 0.0
+    for table, least in zip(weights.ROUNDS, LEAST_ODDS, strict=True):
+        fly = added(evidence(scan, known, thing, strength, taken, asked), table) > least
         out[asked] = fly
         taken[asked] = np.where(fly, AIR, AFTERWARDS[known.said[asked]])
     return out
