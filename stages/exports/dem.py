@@ -51,10 +51,10 @@ def _heights(canvas: Canvas, lattice: Lattice, window: Window, reach: int) -> li
     if cells is None:
         return None
     known = cells["count"] > 0
-    filled = [fill_holes(values, known, reach) for values in (mean_of(cells), cells["lowest"])]
+    filled, has = fill_holes(np.stack((mean_of(cells), cells["lowest"])), known, reach)
     inner = slice(reach, -reach or None)
-    counts = cells["count"][inner, inner]
-    return [*(np.where(has, values, NO_HEIGHT)[::-1] for values, has in filled), counts[::-1]]
+    mean, lowest = np.where(has, filled, NO_HEIGHT)[:, ::-1]
+    return [mean, lowest, cells["count"][inner, inner][::-1]]
 
 
 def _layers(ground: Ground) -> list[Layer]:

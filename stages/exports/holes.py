@@ -2,51 +2,71 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 from numpy.typing import NDArray
 
+from scanloom.stages.geometry.kernels import kernel
+
 F4 = NDArray[np.float32]
+Known = NDArray[np.bool_]
+ALL_SIDES = 0b1111
 
 
-def fill_holes(values: F4, known: NDArray[np.bool_], reach: int) -> tuple[F4, NDArray[np.bool_]]:
+def fill_holes(layers: F4, known: Known, reach: int) -> tuple[F4, Known]:
     """Values of the cells inside a margin of `reach` cells, and which of them have one now.
 
     An empty cell gets the mean of the known cells within `reach`, weighted by the inverse square of their distance
     (Shepard 1968), if there is one in each of its four quadrants: no half-plane of known cells touches all four, so that
     a straight edge of the raster never grows. Only known cells count, in any order of filling the result is the same.
 
-    values, known : (rows + 2 reach, columns + 2 reach).
+    layers : (k, rows + 2 reach, columns + 2 reach), filled each by itself.
+    known : (rows + 2 reach, columns + 2 reach).
     """
     rows, columns = known.shape[0] - 2 * reach, known.shape[1] - 2 * reach
-    inner = (slice(reach, reach + rows), slice(reach, reach + columns))
-    filled, has = values[inner].copy(), known[inner].copy()
-    empty = np.argwhere(~has)
-    if not reach or not len(empty) or not known.any():
-        return filled, has
-    base = np.where(known, values, np.float32(0.0)).astype(np.float64)
-    weight, total = np.zeros(len(empty)), np.zeros(len(empty))
-    sides = np.zeros((4, len(empty)), bool)
-    for up, right in _disc(reach):
-        at = (empty[:, 0] + reach + up, empty[:, 1] + reach + right)
-        here = known[at]
-        w = here / float(up * up + right * right)
-        weight += w
-        total += w * base[at]
-        sides[_quadrant(up, right)] |= here
-    good = sides.all(axis=0)
-    filled[tuple(empty[good].T)] = (total[good] / weight[good]).astype(np.float32)
-    has[tuple(empty[good].T)] = True
+    filled = np.zeros((len(layers), rows, columns), np.float32)
+    has = np.zeros((rows, columns), np.bool_)
+    steps = np.array(_disc(reach), np.int64).reshape(-1, 4)
+    _fill(np.ascontiguousarray(layers, np.float32), np.ascontiguousarray(known), steps, filled, has)
     return filled, has
 
 
-def _disc(reach: int) -> Iterator[tuple[int, int]]:
-    """Steps up and right to every other cell within a distance."""
-    for up in range(-reach, reach + 1):
-        for right in range(-reach, reach + 1):
-            if 0 < up * up + right * right <= reach * reach:
-                yield up, right
+@kernel
+def _fill(layers: F4, known: Known, steps: NDArray[np.int64], filled: F4, has: Known) -> None:
+    """steps (m, 4): up, right, bit of the quadrant, square of the distance."""
+    reach = (known.shape[0] - has.shape[0]) // 2
+    for i in range(has.shape[0]):
+        for j in range(has.shape[1]):
+            if known[i + reach, j + reach]:
+                has[i, j] = True
+                for k in range(layers.shape[0]):
+                    filled[k, i, j] = layers[k, i + reach, j + reach]
+                continue
+            sides = 0
+            for m in range(steps.shape[0]):
+                if known[i + reach + steps[m, 0], j + reach + steps[m, 1]]:
+                    sides |= steps[m, 2]
+            if sides != ALL_SIDES:
+                continue
+            has[i, j] = True
+            for k in range(layers.shape[0]):
+                total, weights = 0.0, 0.0
+                for m in range(steps.shape[0]):
+                    row, column = i + reach + steps[m, 0], j + reach + steps[m, 1]
+                    if known[row, column]:
+                        weight = 1.0 / steps[m, 3]
+                        total += weight * layers[k, row, column]
+                        weights += weight
+                filled[k, i, j] = total / weights
+
+
+def _disc(reach: int) -> list[tuple[int, int, int, int]]:
+    """The steps to every other cell within a distance."""
+    return [
+        (up, right, 1 << _quadrant(up, right), up * up + right * right)
+        for up in range(-reach, reach + 1)
+        for right in range(-reach, reach + 1)
+        if 0 < up * up + right * right <= reach * reach
+    ]
 
 
 def _quadrant(up: int, right: int) -> int:

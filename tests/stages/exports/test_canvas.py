@@ -72,8 +72,9 @@ def test_nothing_painted(tmp_path: Path) -> None:
 
 
 def with_margin(values: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray]:
+    """One layer with an unknown margin, as the function wants it."""
     wide = np.pad(values.astype(np.float32), reach, constant_values=np.nan)
-    return wide, ~np.isnan(wide)
+    return wide[None], ~np.isnan(wide)
 
 
 def test_a_hole_is_filled_from_all_sides() -> None:
@@ -81,7 +82,7 @@ def test_a_hole_is_filled_from_all_sides() -> None:
     slope = 2.0 * rows - 1.0 * columns
     holed = slope.astype(float)
     holed[8:11, 9:12] = np.nan
-    filled, has = fill_holes(*with_margin(holed, 4), 4)
+    (filled,), has = fill_holes(*with_margin(holed, 4), 4)
     assert has.all()
     # Around the middle of a plane all weights are symmetric; off the middle the mean leans to the nearer side.
     assert filled[9, 10] == pytest.approx(slope[9, 10], abs=1e-5)
@@ -121,11 +122,11 @@ def test_windows_do_not_show() -> None:
     rng = np.random.default_rng(5)
     values = np.where(rng.random((60, 70)) < 0.3, np.nan, rng.normal(500.0, 3.0, (60, 70)))
     wide, known = with_margin(values, 4)
-    whole, has = fill_holes(wide, known, 4)
+    (whole,), has = fill_holes(wide, known, 4)
     for row in range(0, 60, 20):
         for column in range(0, 70, 35):
             part = (slice(row, row + 28), slice(column, column + 43))
-            filled, here = fill_holes(wide[part], known[part], 4)
+            (filled,), here = fill_holes(wide[:, *part], known[part], 4)
             np.testing.assert_array_equal(here, has[row : row + 20, column : column + 35])
             same = whole[row : row + 20, column : column + 35]
             np.testing.assert_array_equal(filled[here], same[here])
@@ -135,3 +136,13 @@ def test_no_reach_fills_nothing() -> None:
     values = np.array([[1.0, np.nan, 1.0]])
     _, has = fill_holes(*with_margin(values, 0), 0)
     np.testing.assert_array_equal(has, [[True, False, True]])
+
+
+def test_weights_are_inverse_squares_of_the_distance() -> None:
+    values = np.full((5, 5), np.nan)
+    values[2, 4], values[4, 2], values[2, 1], values[0, 2] = 10.0, 20.0, 30.0, 40.0
+    two = np.stack([with_margin(v, 2)[0][0] for v in (values, -values)])
+    filled, has = fill_holes(two, with_margin(values, 2)[1], 2)
+    assert has[2, 2]
+    want = (10.0 / 4 + 20.0 / 4 + 30.0 / 1 + 40.0 / 4) / (3 / 4 + 1)
+    np.testing.assert_allclose(filled[:, 2, 2], [want, -want], rtol=1e-6)
