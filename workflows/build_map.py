@@ -5,10 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import platform
 import time
 from dataclasses import dataclass, field
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +23,13 @@ from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.session import Session
 from scanloom.schemas.tiles import TileIndex
 from scanloom.schemas.trajectory import Odometry, Poses
-from scanloom.stages.report.page import compose, run_section
+from scanloom.stages.report.page import compose
+from scanloom.stages.report.run import run_section
 from scanloom.workflows.configuration import Overrides, merged
 from scanloom.workflows.delivery import Label, Metric, change_rows, claim, deliver, metric_rows, write_text
 from scanloom.workflows.map_session import NODES
 from scanloom.workflows.parent import Parent, altered_tiles, check_logs, check_new
+from scanloom.workflows.run_part import run_of
 from scanloom.workflows.sessions import Sought, find_sessions
 from scanloom.workflows.sources import log_digests, write_sources
 
@@ -100,7 +100,7 @@ def build_map(order: Order, progress: Progress | None = None) -> Outcome:
     if delivered:
         deliver(result, order.out, _label(order, log_digests(result, sessions, store)))
         write_sources(order.out, sessions, order.settings, order.store)
-        metrics = _deliver_figures(order, result)
+        metrics = _deliver_figures(order, result, sessions)
     return Outcome(
         out=order.out,
         exit_code=_exit_code(failures, delivered),
@@ -161,7 +161,7 @@ def _label(order: Order, logs: dict[str, str]) -> Label:
     return Label(order.name, order.parent.version + 1, order.parent.reference(), logs)
 
 
-def _deliver_figures(order: Order, result: Result) -> list[Metric]:
+def _deliver_figures(order: Order, result: Result, sessions: list[Sought]) -> list[Metric]:
     """`metrics.json` and `report.html`. Their `run.*` part describes the last run that computed something."""
     metrics = metric_rows(result.parts(Metrics)[0]) + change_rows(result)
     previous = _run_metrics(order.out / METRICS_FILE)
@@ -170,10 +170,8 @@ def _deliver_figures(order: Order, result: Result) -> list[Metric]:
     write_text(order.out / METRICS_FILE, json.dumps(metrics, indent=1) + "\n")
     if result.executed or not (order.out / REPORT_FILE).exists():
         body = result.files(ReportFiles)[0][1] / "body.html"
-        page = compose(
-            body.read_text(), run_section(_stage_times(result), _provenance(order, figures)), order.name
-        )
-        write_text(order.out / REPORT_FILE, page)
+        run = run_of(result, sessions, order.settings, order.out, figures)
+        write_text(order.out / REPORT_FILE, compose(body.read_text(), run_section(run), order.name))
     return metrics
 
 
@@ -203,37 +201,6 @@ def _run_metrics(path: Path) -> list[Metric]:
         return [row for row in rows if row["scope"] == "run"]
     except (OSError, ValueError, KeyError, TypeError):
         return []
-
-
-def _stage_times(result: Result) -> list[dict[str, Any]]:
-    """One row per stage, in the order of the workflow."""
-    rows: dict[str, dict[str, Any]] = {
-        n.name: {"stage": n.name, "tasks": 0, "executed": 0, "wall_s": 0.0, "peak_rss_mb": 0.0} for n in NODES
-    }
-    for task in result.tasks:
-        row = rows[task.node]
-        row["tasks"] += 1
-        if task.verdict == "RUN":
-            row["executed"] += 1
-            row["wall_s"] += task.wall_s
-            row["peak_rss_mb"] = max(row["peak_rss_mb"], task.peak_rss_mb)
-    return [row for row in rows.values() if row["tasks"]]
-
-
-def _provenance(order: Order, figures: list[Metric]) -> dict[str, str]:
-    by_name = {row["name"]: row["value"] for row in figures}
-    return {
-        "scanloom": metadata.version("scanloom"),
-        "python": platform.python_version(),
-        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
-        "made": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
-        "sessions": ", ".join(order.sessions),
-        **({"extends": f"{order.parent.name}, version {order.parent.version}"} if order.parent else {}),
-        "settings changed": json.dumps(order.settings) or "none",
-        "wall time": f"{by_name.get('run.wall_s', 0):.1f} s for {by_name.get('run.log_s', 0):.1f} s of log",
-        "real-time factor": f"{by_name.get('run.realtime_factor', 0):.2f}",
-        "peak memory": f"{by_name.get('run.peak_rss_mb', 0):.0f} MB",
-    }
 
 
 def _warnings(result: Result) -> list[str]:

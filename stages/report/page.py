@@ -28,17 +28,6 @@ def _sha256(script: str) -> str:
     return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
-def run_section(stage_times: Sequence[Mapping[str, Any]], provenance: Mapping[str, str]) -> str:
-    """Stage times as bars, and where the map comes from.
-
-    stage_times : per stage `stage`, `tasks`, `executed`, `wall_s` (sum over its tasks) and `peak_rss_mb`.
-    """
-    longest = max([float(row["wall_s"]) for row in stage_times] + [1e-9])
-    total = sum(float(row["wall_s"]) for row in stage_times)
-    rows = [{**row, "percent": 100 * float(row["wall_s"]) / longest} for row in stage_times]
-    return render("run.html", rows=rows, provenance=provenance, total_s=total)
-
-
 FLEET_COLUMNS = (
     ("fusion.ate_rmse_m", "ATE, m"),
     ("odometry.kitti_t_rel_percent", "t_rel, %"),

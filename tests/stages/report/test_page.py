@@ -2,23 +2,58 @@
 
 from __future__ import annotations
 
+import json
+import re
 from typing import Any
 
-from scanloom.stages.report.page import fleet_page, run_section
+from scanloom.stages.report.page import fleet_page
+from scanloom.stages.report.run import Changed, File, Log, Run, StageTime, run_section
 from tests.stages.report.parsing import parse
 
 
-def test_run_section_shows_times_and_provenance() -> None:
-    rows = [
-        {"stage": "deskew", "tasks": 3, "executed": 2, "wall_s": 4.0, "peak_rss_mb": 310.4},
-        {"stage": "odometry", "tasks": 1, "executed": 0, "wall_s": 0.0, "peak_rss_mb": 0.0},
+def test_run_section_shows_times_changed_settings_and_checksums() -> None:
+    stages = [StageTime("deskew", 3, 2, 4.0, 310.4), StageTime("odometry", 1, 0)]
+    changed = [
+        Changed("denoise.dust", "0.5", "0.2", "", "how much <dust>"),
+        Changed("odometry.x", "1", "2", "mon"),
     ]
-    section = run_section(rows, {"scanloom": "0.1.0"})
+    run = Run(
+        stages,
+        changed,
+        {"scanloom": "0.1.0"},
+        [Log("mon", "ab" * 32, 10, 10**9, 2 * 10**9)],
+        [File("map.json", "cd" * 32, 77)],
+    )
+    section = run_section(run)
     text = parse(section).text
-    assert "width: 100.0%" in section
-    assert "4.00" in text
-    assert "310" in text
-    assert "0.1.0" in text
+    for told in (
+        "4.00",
+        "310",
+        "0.1.0",
+        "denoise.dust",
+        "how much <dust>",
+        "ab" * 32,
+        "cd" * 32,
+        "1.000",
+        "all",
+    ):
+        assert told in text
+    times, memory = (json.loads(part) for part in re.findall(r"json\">(.*?)</script>", section))
+    assert times["data"][0]["y"] == memory["data"][0]["y"] == ["deskew"]
+    assert (times["data"][0]["x"], memory["data"][0]["x"]) == ([4.0], [310.0])
+
+
+def test_a_run_that_changed_nothing_says_so_and_many_files_are_counted() -> None:
+    text = parse(run_section(Run(files=[File(f"tiles/{k}.parquet", "0", 1) for k in range(151)]))).text
+    assert "every setting has its default value" in text
+    assert "151 files" in text
+    assert "and 1 more, in map.json" in text
+    assert "Time and memory" not in text
+
+
+def test_only_tasks_of_this_run_have_a_time() -> None:
+    row = StageTime("deskew").plus(True, 2.0, 100.0).plus(False, 9.0, 900.0).plus(True, 1.0, 50.0)
+    assert row == StageTime("deskew", 3, 2, 3.0, 100.0)
 
 
 def metric(name: str, value: float, previous: float | None, session: str = "") -> dict[str, Any]:

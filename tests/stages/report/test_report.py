@@ -29,7 +29,8 @@ from scanloom.stages.evaluation.stage import Settings as EvaluationSettings
 from scanloom.stages.geometry.geodesy import georeference
 from scanloom.stages.report import picture, report
 from scanloom.stages.report.map_picture import Settings as PictureSettings
-from scanloom.stages.report.page import compose, run_section
+from scanloom.stages.report.page import compose
+from scanloom.stages.report.run import Run, run_section
 from scanloom.stages.report.stage import Settings
 from scanloom.stages.report.templates import asset
 from scanloom.stages.tiling import overview
@@ -101,7 +102,7 @@ def test_the_same_map_gives_the_same_bytes(street_map: Map) -> None:
 
 
 def test_the_page_is_one_file_without_outside_references(street_map: Map) -> None:
-    page = compose(body(street_map.report()), run_section([], {}), "street")
+    page = compose(body(street_map.report()), run_section(Run()), "street")
     parser = parse(page)
     assert parser.addresses
     assert all(address.startswith("data:") for address in parser.addresses)
@@ -114,7 +115,7 @@ def test_the_page_is_one_file_without_outside_references(street_map: Map) -> Non
 
 
 def test_scripts_of_the_page_are_those_its_policy_names(street_map: Map) -> None:
-    page = compose(body(street_map.report()), run_section([], {}), "street")
+    page = compose(body(street_map.report()), run_section(Run()), "street")
     policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]+)"', page)
     assert policy is not None
     told = html.unescape(policy[1])
@@ -224,7 +225,9 @@ def test_problems_of_the_log_reach_the_page_and_are_escaped(street_map: Map) -> 
     )
     problem = Problem(code="imu.gap", severity="error", text="silent for <b>2 s</b>", topic="/imu")
     session = session_of("a", 5, topics=(topic,), problems=(problem,), complete=False)
-    page = compose(body(street_map.report(session=one(session))), run_section([], {"<i>": "<u>"}), "<title>")
+    page = compose(
+        body(street_map.report(session=one(session))), run_section(Run(facts={"<i>": "<u>"})), "<title>"
+    )
     assert "<script>alert" not in page
     assert "<b>2 s" not in page
     assert "<dt><i>" not in page
