@@ -71,7 +71,7 @@ class Page:
             raise RuntimeError(json.dumps(answer["exceptionDetails"])[:2000])
         return answer["result"].get("value")
 
-    def wait(self, condition: str, limit_s: float = 60.0) -> None:
+    def wait(self, condition: str, limit_s: float = 40.0) -> None:
         """Until an expression is true."""
         until = time.monotonic() + limit_s
         while not self.run(f"Boolean({condition})"):

@@ -41,7 +41,7 @@ end_header
 def scene() -> np.ndarray:
     """Points (n, 3): ground and a wall."""
     rng = np.random.default_rng(11)
-    ground = np.column_stack((rng.uniform(-60, 60, (POINTS - 5_000, 2)), rng.normal(0, 0.02, POINTS - 5_000)))
+    ground = np.column_stack((rng.uniform(-30, 30, (POINTS - 5_000, 2)), rng.normal(0, 0.02, POINTS - 5_000)))
     wall = np.column_stack((rng.uniform(-20, 20, 5_000), np.full(5_000, 12.0), rng.uniform(0, 8, 5_000)))
     return np.concatenate((ground, wall)).astype(np.float32).astype(float)
 
@@ -57,7 +57,7 @@ def make_map(folder: Path, *, removed: int = 0) -> None:
     }
     tiles = cut(scene(), columns=columns, georeference=ORIGIN.model_dump(), sessions=("drive",))
     write_map(folder, tiles, name="Old town")
-    along = np.column_stack((np.linspace(-50, 50, SCANS), np.zeros(SCANS), np.full(SCANS, 1.7)))
+    along = np.column_stack((np.linspace(-25, 25, SCANS), np.zeros(SCANS), np.full(SCANS, 1.7)))
     poses_along(along, ORIGIN, yaw_rad=0.0).write(folder / "trajectory.parquet")
     _loops().write(folder / "loops.parquet")
     _car().write(folder / "objects.parquet")
@@ -66,7 +66,7 @@ def make_map(folder: Path, *, removed: int = 0) -> None:
 
 def _removed(count: int) -> bytes:
     rows = np.zeros(count, np.dtype([("p", "<f4", 3), ("intensity", "<f4"), ("class", "u1")]))
-    places = np.random.default_rng(12).uniform(-60, 60, (count, 3)) * (1, 1, 0.02)
+    places = np.random.default_rng(12).uniform(-30, 30, (count, 3)) * (1, 1, 0.02)
     rows["p"] = places[np.lexsort(np.floor(places[:, 1::-1] / 50.0).T)]
     rows["class"] = PointClass.DYNAMIC
     return PLY % count + rows.tobytes()

@@ -180,7 +180,7 @@ def test_lines_stand_where_they_were_driven(served: Server) -> None:
     layers = json_of(served, "/data/layers.json")
     (track,) = layers["trajectories"]
     assert track["session"] == "drive" and len(track["points"]) == 40
-    assert track["points"][0] == [-50.0, 0.0, 1.7] and track["points"][-1] == [50.0, 0.0, 1.7]
+    assert track["points"][0] == [-25.0, 0.0, 1.7] and track["points"][-1] == [25.0, 0.0, 1.7]
     (loop,) = layers["loops"]
     assert (loop["from"], loop["to"]) == (track["points"][2], track["points"][30])
     (car,) = layers["objects"]

@@ -19,7 +19,9 @@ class App {
     this.measuring = false;
     this.budget = 10 ** 6.5;
     this.size = 1.5;
-    const changed = () => { this.dirty = true; };
+    this.stale = false;
+    this.drawn = 0;
+    const changed = () => { this.stale = true; };
     this.material = pointMaterial(map);
     this.cloud = new Cloud(`${DATA}tileset/`, this.material, changed);
     this.removed = null;
@@ -88,7 +90,7 @@ class App {
     if (!this.removed) {
       const material = this.material.clone();
       material.uniforms.mode.value = MODES.indexOf("class");
-      this.removed = new Cloud(`${DATA}removed/`, material, () => { this.dirty = true; });
+      this.removed = new Cloud(`${DATA}removed/`, material, () => { this.stale = true; });
       this.view.scene.add(this.removed.group);
     }
     this.removed.group.visible = on;
@@ -127,12 +129,19 @@ class App {
 
   // --- drawing ---
 
+  // What the user does is seen at once, what arrives a few times a second.
+  due(now) {
+    if (!this.dirty && !(this.stale && now - this.drawn > 120)) return false;
+    this.dirty = this.stale = false;
+    this.drawn = now;
+    return true;
+  }
+
   frame() {
     const { view, cloud } = this;
     cloud.update(view.camera, view.renderer, this.budget);
     if (this.removed) this.removed.update(view.camera, view.renderer, this.budget / 4);
-    if (!this.dirty && !cloud.busy) return;
-    this.dirty = false;
+    if (!this.due(performance.now())) return;
     const ratio = view.renderer.getPixelRatio();
     for (const { material } of [cloud, this.removed].filter(Boolean)) {
       const { uniforms } = material;
@@ -143,6 +152,7 @@ class App {
     view.draw();
     this.overlay.draw();
     this.status();
+    if (cloud.busy || this.removed?.busy) this.stale = true;
   }
 
   status() {

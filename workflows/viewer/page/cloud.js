@@ -69,7 +69,7 @@ export function pointMaterial(map) {
 }
 
 export class Cloud {
-  // `base` is where its tileset stands; `changed` is called when another picture is due.
+  // `base` is where its tileset stands; `changed` is called when another picture is due, `true` when it may wait a little.
   constructor(base, material, changed) {
     this.base = base;
     this.material = material;
@@ -79,6 +79,7 @@ export class Cloud {
     this.tiles = new TilesRenderer(`${base}tileset.json`);
     this.tiles.errorTarget = this.wanted;
     this.tiles.downloadQueue.maxJobsPerOrigin = 6;
+    this.tiles.parseQueue.maxJobs = 24;
     this.tiles.addEventListener("load-model", ({ scene, url }) => {
       scene.traverse((part) => {
         if (!part.isPoints) return;
@@ -86,13 +87,13 @@ export class Cloud {
         part.userData.node = nodeOf(base, url);
         this.loaded += part.geometry.attributes.position.count;
       });
-      changed();
+      changed(true);
     });
     this.tiles.addEventListener("dispose-model", ({ scene }) => {
       scene.traverse((part) => { if (part.isPoints) this.loaded -= part.geometry.attributes.position.count; });
     });
     this.tiles.addEventListener("load-error", () => { this.failed++; });
-    for (const event of ["needs-update", "tile-visibility-change", "tiles-load-end"]) this.tiles.addEventListener(event, changed);
+    for (const event of ["needs-update", "tile-visibility-change", "tiles-load-end"]) this.tiles.addEventListener(event, () => changed(true));
   }
 
   get group() { return this.tiles.group; }
