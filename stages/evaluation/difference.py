@@ -111,7 +111,8 @@ def _inner_points(tile: Tile, share: float) -> F8:
     rows = ((2 * np.arange(m, dtype=np.int64) + 1) * len(tile)) // (2 * max(m, 1))
     local = np.column_stack((tile.x_m[rows], tile.y_m[rows], tile.z_m[rows])).astype(float)
     inner = (local[:, :2] > BORDER_M).all(axis=1) & (local[:, :2] < tile.tile_size_m - BORDER_M).all(axis=1)
-    return local[inner] + np.array(tile.offset_m)
+    found: F8 = local[inner] + np.array(tile.offset_m)
+    return found
 
 
 def _around(ground: Ground, queries: F8) -> Iterable[F8]:

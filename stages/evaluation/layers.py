@@ -35,10 +35,15 @@ BIN_M = 0.02
 _BINS = 60
 STEP_RAD, STEPS = np.radians(0.5), 12
 """How far the normal is turned to each side to find the sharpest view."""
+ENOUGH_POINTS = 150
+"""Of a patch to turn its normal by."""
 LEAST_POINTS = 40
 _MOST_POINTS = 4096
 LEAST_EXTENT_M = 1.0
 """A layer reaches so far along the wall and upwards, or it is a post or a ledge."""
+STEP_M = 0.04
+_STEPS = 50
+"""In which extents are measured."""
 LEAST_SHARE = 0.15
 """Of the points of a patch that a layer needs."""
 HALF_LAYER = 4
@@ -160,13 +165,19 @@ def _gathered(
 @kernel
 def _sharpened(local: F8) -> None:
     """Turn the normal, first sideways then up, to where the distances along it fall into the fewest bins."""
+    some = local[:: max(len(local) // ENOUGH_POINTS, 1)]
     for axis in range(1, 3):
-        best, slope = -1.0, 0.0
-        for step in range(-STEPS, STEPS + 1):
-            tried = np.tan(step * STEP_RAD)
-            sharp = _sharpness(local, axis, tried)
+        around, best = 0, -1.0
+        for step in range(-STEPS, STEPS + 1, 2):
+            sharp = _sharpness(some, axis, np.tan(step * STEP_RAD))
             if sharp > best:
-                best, slope = sharp, tried
+                best, around = sharp, step
+        turned = around
+        for step in (around - 1, around + 1):
+            sharp = _sharpness(some, axis, np.tan(step * STEP_RAD))
+            if sharp > best:
+                best, turned = sharp, step
+        slope = np.tan(turned * STEP_RAD)
         for n in range(len(local)):
             local[n, 0] -= slope * local[n, axis]
 
@@ -265,12 +276,26 @@ def _large(local: F8, rows: NDArray[np.bool_]) -> bool:
     """Whether a layer is a surface: wide and high."""
     if rows.sum() < 10:
         return False
-    for axis in range(1, 3):
-        places = np.sort(local[rows, axis])
-        last = len(places) - 1
-        if places[int(0.95 * last)] - places[int(0.05 * last)] < 0.8 * LEAST_EXTENT_M:
-            return False
-    return True
+    return _extent(local, rows, 1) and _extent(local, rows, 2)
+
+
+@kernel
+def _extent(local: F8, rows: NDArray[np.bool_], axis: int) -> bool:
+    """Whether the middle nine tenths of the points reach far enough along an axis."""
+    steps = np.zeros(_STEPS, np.int64)
+    total = 0
+    for n in range(len(local)):
+        if rows[n]:
+            steps[min(max(int((local[n, axis] + RADIUS_M) / STEP_M), 0), _STEPS - 1)] += 1
+            total += 1
+    low, high, below = -1, -1, 0
+    for k in range(_STEPS):
+        below += steps[k]
+        if low < 0 and below > 0.05 * total:
+            low = k
+        if high < 0 and below >= 0.95 * total:
+            high = k
+    return (high - low) * STEP_M >= 0.8 * LEAST_EXTENT_M
 
 
 @kernel

@@ -93,8 +93,8 @@ def survey(tile: Tile, removed: RemovedTile | None, passes: Passes, manner: Mann
     return Survey(
         points=len(tile),
         returns=int(tile.count.sum()),
-        squares=len(np.unique(square)),
-        again_squares=len(np.unique(square[again])),
+        squares=_filled(square),
+        again_squares=_filled(square[again]),
         again=int(again.sum()),
         other=int(other.sum()),
         ground=_ground(square[tile.class_ == PointClass.GROUND]),
@@ -140,11 +140,20 @@ def _walls(
 
 
 def _squares(points: F4) -> I8:
-    """Number (n,) of the square of 1 m that each point lies in."""
+    """Number (n,) of the square of 1 m that each point lies in, from the lowest corner of all."""
+    if not len(points):
+        return np.empty(0, np.int64)
     column, row = np.floor(points[:, 0]).astype(np.int64), np.floor(points[:, 1]).astype(np.int64)
-    return (column << 32) + row
+    column, row = column - column.min(), row - row.min()
+    return column * (row.max() + 1) + row
+
+
+def _filled(square: I8) -> int:
+    """How many different squares there are among them."""
+    return int(np.count_nonzero(np.bincount(square)))
 
 
 def _ground(square: I8) -> I8:
-    """How many squares have 0, 1, 2, ... of the points whose squares are given."""
-    return np.bincount(np.unique(square, return_counts=True)[1])
+    """How many squares have 0, 1, 2, ... of the points whose squares are given; those without any do not count."""
+    counts = np.bincount(square)
+    return np.bincount(counts[counts > 0])

@@ -28,9 +28,9 @@ class Columns:
     """Points (n, 3) sorted into upright columns with a square base, by counting; `order` says where each came from."""
 
     def __init__(self, points: F4, radius_m: float) -> None:
-        xy = points[:, :2] if len(points) else np.zeros((1, 2), np.float32)
-        self.low = xy.min(axis=0).astype(float)
-        span = xy.max(axis=0).astype(float) - self.low
+        x, y = (points[:, 0], points[:, 1]) if len(points) else (np.zeros(1), np.zeros(1))
+        self.low = np.array([x.min(), y.min()], float)
+        span = np.array([x.max(), y.max()], float) - self.low
         self.size_m = max(radius_m / REACH, float(span.max()) / _MOST_COLUMNS)
         self.shape = np.floor(span / self.size_m).astype(np.int64) + 1
         flat = _cells(points, self.low, self.size_m, int(self.shape[1]))
