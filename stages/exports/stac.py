@@ -57,6 +57,7 @@ WITH_A_SYSTEM_OF_ITS_OWN: dict[str, str | None] = {
     "gpx": "EPSG:4326",
     "geojson": "EPSG:4326",
     "3dtiles": "EPSG:4978",
+    "autoware": None,
 }
 LOOKED_AT = {".html", ".png", ".json"}
 """Files that have no coordinates."""
