@@ -122,7 +122,7 @@ def compare_maps(folder_a: Path, folder_b: Path, noise_from: Sequence[Path] = ()
     """
     a, b = read_side(folder_a), read_side(folder_b)
     noise = noise_of(noise_from) if noise_from else None
-    judged, notes = _judged(a, b)
+    judged, notes = judged_sessions(a, b)
     if noise is None and judged:
         notes.append(
             "No noise was measured: what is allowed is the default of each metric (docs/metrics.md)."
@@ -175,7 +175,7 @@ def _metrics(folder: Path) -> list[Row]:
     raise InvalidInput("is missing or damaged", where=str(path), next_step="make the map again")
 
 
-def _judged(a: Side, b: Side) -> tuple[frozenset[str], list[str]]:
+def judged_sessions(a: Side, b: Side) -> tuple[frozenset[str], list[str]]:
     """Sessions whose metrics may be judged, "" for the whole map, "*" for a session without a name; and what to say of it."""
     shared = [name for name, log in a.sessions.items() if b.sessions.get(name) == log]
     by_log = {log for log in a.sessions.values() if log} & {log for log in b.sessions.values() if log}

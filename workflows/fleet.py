@@ -34,6 +34,13 @@ class Fleet(BaseModel):
     )
     out: str = Field(default="night", description="folder of maps and summary, relative to the fleet file")
     settings: dict[str, dict[str, Any]] = {}
+    gate: bool = Field(
+        default=False, description="end with exit code 5 when a map is worse than the one of the night before"
+    )
+    noise: str | None = Field(
+        default=None,
+        description="file of noise for the gate, relative to the fleet file; else default tolerances",
+    )
 
 
 def read_fleet(path: Path) -> Fleet:
@@ -53,7 +60,9 @@ def read_fleet(path: Path) -> Fleet:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         raise UsageError(
-            f"{place}: {first['msg']}", where=str(path), next_step="known entries: maps, each, out, settings"
+            f"{place}: {first['msg']}",
+            where=str(path),
+            next_step="known entries: maps, each, out, settings, gate, noise",
         ) from error
     checked_overrides(fleet.settings, str(path))
     if not fleet.maps and not fleet.each:

@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from scanloom.pipeline.progress import Progress
-from scanloom.schemas.errors import EXIT_INTERNAL, EXIT_OK, EXIT_SOME_FAILED, ScanloomError
+from scanloom.schemas.errors import EXIT_INTERNAL, EXIT_OK, EXIT_REGRESSION, EXIT_SOME_FAILED, ScanloomError
 from scanloom.stages.report.page import fleet_page
 from scanloom.workflows.build_map import Order, Outcome, build_map
 from scanloom.workflows.configuration import merged, project_settings
 from scanloom.workflows.delivery import write_text
 from scanloom.workflows.fleet import Fleet, MapEntry, read_fleet, sessions_by_map
+from scanloom.workflows.gate import as_it_was, worse_than
+from scanloom.workflows.noise import read_noise
 
 log = logging.getLogger(__name__)
 
@@ -31,6 +33,7 @@ class Night:
     page: Path
     summary: dict[str, Any]
     failures: list[str]
+    regressions: list[str]
     exit_code: int
 
 
@@ -45,26 +48,34 @@ def run_fleet(
 ) -> Night:
     """Make every map of a fleet file and write the summary.
 
-    A log or a map that fails is named with its cause and leaves the others alone.
+    A log or a map that fails is named with its cause and leaves the others alone. With `gate`, each map is held against the
+    one that its folder held before.
 
     Raises
     ------
     UsageError : the fleet file itself cannot be used.
+    InvalidInput : the file of noise cannot.
     """
     fleet = read_fleet(fleet_file)
+    noise = read_noise(fleet_file.parent / fleet.noise) if fleet.noise else None
     folder = out or fleet_file.parent / fleet.out
     last_night = _read_summary(folder / SUMMARY_FILE)
     rows = []
     for name, sessions in sessions_by_map(fleet, fleet_file.parent).items():
         order = _order(name, sessions, fleet, folder, store)
         order = dataclasses.replace(order, cluster=cluster, workers=workers)
-        rows.append(_row(name, sessions, _make(order, progress), folder))
+        before = as_it_was(order.out) if fleet.gate else None
+        row = _row(name, sessions, _make(order, progress), folder)
+        row["regressions"] = worse_than(before, order.out, noise) if row["delivered"] else []
+        row["warnings"] = [*row["warnings"], *row["regressions"]]
+        rows.append(row)
     made = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
     summary: dict[str, Any] = {"maps": rows, "made": made}
     write_text(folder / PAGE_FILE, fleet_page(with_changes(rows, last_night), made=made))
     write_text(folder / SUMMARY_FILE, json.dumps(summary, indent=1) + "\n")
     failures = [f"{row['map']}: {failure}" for row in rows for failure in row["failures"]]
-    return Night(folder / PAGE_FILE, summary, failures, _exit_code(rows))
+    worse = [f"{row['map']}: {text}" for row in rows for text in row["regressions"]]
+    return Night(folder / PAGE_FILE, summary, failures, worse, _exit_code(rows))
 
 
 def _order(name: str, sessions: list[str], fleet: Fleet, folder: Path, store: Path) -> Order:
@@ -133,4 +144,6 @@ def _read_summary(path: Path) -> list[dict[str, Any]]:
 
 
 def _exit_code(rows: list[dict[str, Any]]) -> int:
-    return EXIT_SOME_FAILED if any(row["failures"] for row in rows) else EXIT_OK
+    if any(row["failures"] for row in rows):
+        return EXIT_SOME_FAILED
+    return EXIT_REGRESSION if any(row["regressions"] for row in rows) else EXIT_OK

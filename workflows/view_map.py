@@ -19,8 +19,10 @@ def view_map(folder: Path, port: int, browser: bool, say: Callable[[str], None])
     InvalidInput : the folder holds no map.
     UsageError : the port is taken.
     """
-    with Server(port, Answers(folder)) as server:
+    answers = Answers(folder)
+    with Server(port, answers) as server:
         say(f"{folder}: {server.url}   stop with Ctrl-C")
+        threading.Thread(target=answers.prepare, daemon=True).start()
         if browser:
             threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
         try:

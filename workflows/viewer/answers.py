@@ -40,6 +40,10 @@ class Answers:
         self.removed = Removed(self.source)
         self._blocks = {node.name: node for node in self.reader.root.walk()}
 
+    def prepare(self) -> None:
+        """Read what the page asks for first, before it does."""
+        self.answer("map.json")
+
     def answer(self, path: str) -> tuple[str, bytes]:
         """Content type and body of what stands at a path below `/data/`.
 

@@ -251,16 +251,19 @@ async function addLayers(app) {
   app.dirty = true;
 }
 
+const answered = fetch(`${DATA}map.json`);
+
 async function start() {
-  if (!document.createElement("canvas").getContext("webgl2")) {
+  const context = $("canvas").getContext("webgl2", { alpha: true, antialias: false, powerPreference: "high-performance" });
+  if (!context) {
     say("This page draws with WebGL 2, which this browser does not offer.\n\nSwitch hardware acceleration on in its settings, or open the page in a current Chrome, Edge, Firefox or Safari.");
     return;
   }
-  const answer = await fetch(`${DATA}map.json`);
+  const answer = await answered;
   if (!answer.ok) throw new Error(await answer.text());
   const map = await answer.json();
   let app = null;
-  const view = new View($("canvas"), () => { if (app) app.dirty = true; });
+  const view = new View($("canvas"), context, () => { if (app) app.dirty = true; });
   app = new App(map, view);
   window.scanloom = app;
   describeMap(map);
@@ -272,8 +275,8 @@ async function start() {
   app.colour("height");
   app.use(false);
   app.fit();
-  await addLayers(app);
   view.renderer.setAnimationLoop(() => app.frame());
+  await addLayers(app);
 }
 
 start().catch((error) => { say(`The map cannot be shown: ${error.message}`); throw error; });

@@ -36,8 +36,8 @@ void main() {
 const FULL = `varying vec2 at; void main() { at = uv; gl_Position = vec4(position.xy, 0.0, 1.0); }`;
 
 export class View {
-  constructor(canvas, changed) {
-    this.renderer = new WebGLRenderer({ canvas, antialias: false, alpha: true, powerPreference: "high-performance" });
+  constructor(canvas, context, changed) {
+    this.renderer = new WebGLRenderer({ canvas, context, alpha: true });
     this.renderer.setClearColor(0x000000, 0);
     this.renderer.autoClear = false;
     this.scene = new Scene();
