@@ -117,8 +117,8 @@ def split(rows: Rows, blocks: NDArray[np.int64]) -> dict[Block, Rows]:
     number = number[order]
     starts = np.flatnonzero(np.append(True, number[1:] != number[:-1]))
     ends = np.append(starts[1:], len(rows))
-    rows = rows[order]
+    # Pieces of their own: a view would keep all the others in memory.
     return {
-        (int(low[0] + number[a] // width), int(low[1] + number[a] % width)): rows[a:b]
+        (int(low[0] + number[a] // width), int(low[1] + number[a] % width)): rows[order[a:b]]
         for a, b in zip(starts, ends)
     }

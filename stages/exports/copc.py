@@ -96,7 +96,7 @@ class _Walk:
             if level < self._octree.block_level:
                 self._write_level(level, of_level)
             else:
-                self._waiting[level].append(of_level)
+                self._waiting[level].append(of_level.copy())
 
     def _write_level(self, level: int, rows: Rows) -> None:
         """All nodes of a level that these rows make."""
