@@ -7,6 +7,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from scanloom.schemas.metrics import kind_of
 from scanloom.stages.report.templates import asset, render, style
 
 
@@ -37,8 +38,6 @@ FLEET_COLUMNS = (
     ("map.points", "points"),
     ("run.realtime_factor", "real-time"),
 )
-_HIGHER_IS_BETTER = {"loops.accepted", "run.realtime_factor", "loops.precision", "loops.recall"}
-_NEUTRAL = {"map.points", "loops.candidates", "map.tiles"}
 
 
 def fleet_page(rows: Sequence[Mapping[str, Any]], made: str, title: str = "Nightly maps") -> str:
@@ -85,6 +84,9 @@ def _cell(metrics: Mapping[str, Mapping[str, Any]], name: str) -> dict[str, Any]
 
 def _trend(name: str, change: float | None, previous: float | None) -> str:
     """`better`, `worse`, or nothing for changes under one per cent."""
-    if not change or name in _NEUTRAL or abs(change) < 0.01 * abs(previous or 0.0):
+    kind = kind_of(name)
+    if not change or previous is None or kind is None or not kind.better:
         return ""
-    return "better" if (change > 0) == (name in _HIGHER_IS_BETTER) else "worse"
+    if abs(change) < 0.01 * abs(previous):
+        return ""
+    return "better" if kind.badness(previous + change) < kind.badness(previous) else "worse"

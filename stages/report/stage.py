@@ -72,6 +72,12 @@ class Settings(BaseModel):
     drift_warn_percent: float = Field(
         2.0, gt=0.0, description="odometry drift worth a warning; five times it fails, %"
     )
+    double_warn: float = Field(
+        0.05, ge=0.0, le=1.0, description="share of walls that look double worth a warning"
+    )
+    double_fail: float = Field(
+        0.3, ge=0.0, le=1.0, description="share of walls that look double that spoils the map"
+    )
 
 
 def report(
@@ -182,6 +188,7 @@ def _limits(settings: Settings) -> Limits:
     return Limits(
         settings.unreliable_warn, settings.unreliable_fail, settings.gnss_warn_m, settings.gnss_fail_m,
         settings.ate_warn_m, settings.drift_warn_percent, settings.open_path_warn_m,
+        settings.double_warn, settings.double_fail,
     )  # fmt: skip
 
 

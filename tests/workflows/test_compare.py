@@ -19,6 +19,7 @@ from scanloom.stages.geometry.se3 import F8, pose, se3_exp, so3_exp
 from scanloom.workflows.cli import app
 from scanloom.workflows.compare_maps import compare_maps, noise_of
 from scanloom.workflows.comparison_text import text_of_comparison, text_of_noise
+from scanloom.workflows.gate import as_it_was, worse_than
 from scanloom.workflows.metric_changes import metric_changes
 from scanloom.workflows.noise import measured, read_noise
 from tests.delivered import cut, write_map
@@ -320,3 +321,18 @@ def test_settings_and_sizes_that_differ_are_named(tmp_path: Path) -> None:
     assert {row.name: row.a for row in found.sizes}["bytes of all files"] == "1 234"
     assert "odometry.voxel_size_m" in text_of_comparison(found)
     assert replace(found, metrics=[]).exit_code == 0
+
+
+def test_the_gate_holds_a_map_against_what_its_folder_held_before(tmp_path: Path) -> None:
+    folder = made(tmp_path / "a", rows(map__mme_r0__5_nat=-2.0, loops__recall=0.9))
+    before = as_it_was(folder)
+    assert worse_than(before, folder, None) == []
+    (folder / "metrics.json").write_text(json.dumps(rows(map__mme_r0__5_nat=-1.9, loops__recall=0.9)))
+    (text,) = worse_than(before, folder, None)
+    assert text == "regression: map.mme_r0.5_nat went from -2 to -1.9; 0.03 are allowed (default)"
+    noise = measured([("", rows(map__mme_r0__5_nat=v)) for v in (-2.0, -1.98, -2.02)])
+    assert worse_than(before, folder, noise) == []
+    other = made(tmp_path / "b", rows(map__mme_r0__5_nat=5.0), log="b" * 64)
+    assert worse_than(before, other, None) == []  # other logs say nothing
+    assert as_it_was(tmp_path / "nowhere") is None
+    assert worse_than(None, folder, None) == worse_than(before, tmp_path / "nowhere", None) == []

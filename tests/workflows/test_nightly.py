@@ -6,7 +6,8 @@ import json
 import shutil
 from pathlib import Path
 
-from scanloom.workflows.nightly import run_fleet, with_changes
+from scanloom.workflows.nightly import Night, run_fleet, with_changes
+from scanloom.workflows.noise import measured
 from tests.logs import scan_folder
 
 
@@ -46,3 +47,34 @@ def test_change_since_last_night() -> None:
     rows = with_changes(tonight, before)
     assert rows[0]["metrics"][0]["previous"] == 1.5 and not rows[0]["new"]
     assert rows[1]["metrics"][0]["previous"] is None and rows[1]["new"]
+
+
+def test_the_gate_stops_a_map_that_is_worse_than_last_night(tmp_path: Path) -> None:
+    scan_folder(tmp_path / "logs/drive", count=6)
+    fleet = tmp_path / "fleet.yaml"
+    fleet.write_text("each: ['logs/*']\ngate: true\n")
+
+    def night() -> Night:
+        return run_fleet(fleet, None, tmp_path / "store", cluster="none")
+
+    assert night().exit_code == 0  # there is nothing to be worse than
+    metrics = tmp_path / "night/maps/drive/metrics.json"
+    rows = json.loads(metrics.read_text())
+    (entropy,) = [row for row in rows if row["name"] == "map.mme_r0.5_nat"]
+    entropy["value"] -= 0.05
+    metrics.write_text(json.dumps(rows))
+    worse = night()
+    assert worse.exit_code == 5
+    (text,) = worse.regressions
+    assert text.startswith("drive: regression: map.mme_r0.5_nat")
+    assert "regression: map.mme_r0.5_nat" in worse.page.read_text()
+    assert night().exit_code == 0  # the worse map is what the next is held against
+
+    noise = measured([("", [{"name": "map.mme_r0.5_nat", "value": v}]) for v in (1.0, 1.1, 1.2)])
+    noise.write(tmp_path / "noise.json")
+    fleet.write_text("each: ['logs/*']\ngate: true\nnoise: noise.json\n")
+    metrics.write_text(json.dumps(rows))
+    assert night().exit_code == 0
+    fleet.write_text("each: ['logs/*']\n")
+    metrics.write_text(json.dumps(rows))
+    assert night().exit_code == 0
