@@ -121,7 +121,7 @@ def _fix_chart(session: str, fixes: FixRows, way: Way, kinds: NDArray[np.object_
 
 
 def _dots(label: str, way: Way, rows: NDArray[np.int64], y: F8, colour: str) -> Trace:
-    kept = thin(y)
+    kept = thin(y, way.most)
     at = rows[kept]
     return {
         "type": "scatter", "mode": "markers", "name": label, "x": fixed(way.driven_m[at]),

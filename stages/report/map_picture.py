@@ -27,7 +27,7 @@ VERSION = 1
 PREVIEW, OVERLAY, LEFT_OUT, VIEW = "preview.png", "overlay.svg", "left_out.png", "view.json"
 LAYERS = {"height": "height.webp", "intensity": "intensity.webp", "classes": "classes.webp"}
 """The map alone, coloured by what the key says."""
-_QUALITY = 80
+_QUALITY = 72
 
 
 class Settings(BaseModel):

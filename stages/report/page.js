@@ -5,7 +5,6 @@
   if (typeof Plotly === "undefined") return;
   root.classList.add("scripted");
 
-  const PAPER_PX = 690;
   const WORSE = [[0, "#2c7bb6"], [0.35, "#7fcdbb"], [0.65, "#fec44f"], [1, "#d7191c"]];
   const points = matchMedia("(hover: hover) and (pointer: fine)").matches;
   const CONFIG = {
@@ -46,14 +45,14 @@
 
   function height(spec, width) {
     if (spec.height) return spec.height;
-    if (spec.kind !== "plan") return (spec.layout.yaxis2 ? 290 : 240) + (width < 560 ? 20 : 0);
+    if (spec.kind !== "plan") return (spec.layout.yaxis2 ? 310 : 240) + (width < 560 ? 20 : 0);
     const [wide, high] = extent(spec.data);
-    return Math.round(Math.min(Math.max((width - 90) * high / wide, 180), 0.6 * width + 80, 560)) + 100;
+    return Math.round(Math.min(Math.max((width - 90) * high / wide, 180), 0.6 * width + 80, 560)) + 60;
   }
 
   function layout(figure) {
     const { spec } = figure;
-    const width = root.classList.contains("paper") ? PAPER_PX : figure.box.clientWidth;
+    const width = figure.box.clientWidth;
     const small = width < 560;
     const own = themed(structuredClone(spec.layout));
     const common = { gridcolor: shade("--line"), linecolor: shade("--line"), tickcolor: shade("--line"), automargin: true };
@@ -118,10 +117,7 @@
       trace.marker = {
         size: 6, color: values, cmin: found.low, cmax: found.high, colorscale: scale, showscale: k === 0,
         opacity: values.map((v) => (v === null ? 0 : 1)),
-        colorbar: {
-          orientation: "h", y: 1.01, yanchor: "bottom", x: 0, xanchor: "left", len: 0.6, thickness: 9, outlinewidth: 0,
-          title: { text: `${found.label}, ${found.unit}`, side: "top" }, nticks: 6, exponentformat: "none",
-        },
+        colorbar: { thickness: 10, outlinewidth: 0, x: 1.01, xpad: 4, nticks: 6, ticksuffix: ` ${found.unit}`, exponentformat: "none" },
       };
       trace.text = values.map((v) => `${trace.name}<br>${found.label}: ${v === null ? "unknown" : `${v} ${found.unit}`}`);
     });
@@ -193,18 +189,16 @@
     spot.setAttribute("cy", view.height - (at[1] - view.bottom_m) / view.pixel_m);
   }
 
-  // Plots along the way of one session show the same stretch of it.
-  let zooming = false;
+  // Plots along the way of one session show the same stretch of it; those that do already are left alone.
   function zoomed(figure) {
-    if (zooming) return;
     const range = figure.area._fullLayout.xaxis.range.slice();
-    zooming = true;
     for (const other of figures) {
       if (other.spec.kind !== "along" || other.spec.session !== figure.spec.session) continue;
       other.range = range;
-      if (other !== figure && other.drawn) Plotly.relayout(other.area, { "xaxis.range": range });
+      if (!other.drawn) continue;
+      const shown = other.area._fullLayout.xaxis.range;
+      if (shown[0] !== range[0] || shown[1] !== range[1]) Plotly.relayout(other.area, { "xaxis.range": range.slice() });
     }
-    zooming = false;
   }
 
   // --- when: one plot after the other, at once for print, again when the page's colours or width change ---------------

@@ -55,16 +55,8 @@ def marks_plan(label: str, ways: Mapping[str, Way], marks: list[Trace]) -> Plot:
 
 
 def _layout() -> dict[str, Any]:
-    square = {"scaleanchor": "x", "scaleratio": 1}
-    return {
-        "xaxis": {"title": {"text": "x, m", "standoff": 6}, "zeroline": False, "constrain": "range"},
-        "yaxis": {
-            "title": {"text": "y, m", "standoff": 6},
-            "zeroline": False,
-            "constrain": "range",
-            **square,
-        },
-    }
+    shown = {"zeroline": False, "constrain": "range", "ticksuffix": " m"}
+    return {"xaxis": {**shown}, "yaxis": {**shown, "scaleanchor": "x", "scaleratio": 1}}
 
 
 def _tracks(ways: Mapping[str, Way]) -> list[Trace]:

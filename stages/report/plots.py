@@ -24,6 +24,7 @@ MOST_POINTS = 2000
 """Points of a curve; longer ones are thinned."""
 MOST_BANDS = 150
 _LEAST_LOG_SPAN = 1.2
+_FEW_DECADES = 2.5
 
 
 @dataclass(frozen=True)
@@ -123,14 +124,11 @@ def logarithmic(title: str, values: F8, least: float) -> dict[str, Any]:
     known = np.maximum(values[np.isfinite(values)], least)
     low, high = (np.log10(known.min()), np.log10(known.max())) if len(known) else (0.0, 0.0)
     spare = max(_LEAST_LOG_SPAN - (high - low), 0.16) / 2
-    ticks = 1 if high - low > 2 * _LEAST_LOG_SPAN else "D2"
-    return axis(
-        title,
-        type="log",
-        range=[round(low - spare, 3), round(high + spare, 3)],
-        exponentformat="none",
-        dtick=ticks,
-    )
+    low, high = round(float(low - spare), 3), round(float(high + spare), 3)
+    steps = (1, 2, 5) if high - low < _FEW_DECADES else (1,)
+    marks = [float(f"{step}e{k}") for k in range(math.floor(low), math.ceil(high)) for step in steps]
+    ticks = {"tickvals": marks, "ticktext": [f"{mark:g}" for mark in marks]}
+    return axis(title, type="log", range=[low, high], **ticks)
 
 
 def bands(ranges: F8, colour: str, end: float) -> list[dict[str, Any]]:
@@ -164,7 +162,7 @@ def rows_of(
         )  # fmt: skip
     count = len(labels)
     rows = {
-        "domain": [0, 0.055 * count + 0.02], "range": [count - 0.5, -0.5], "tickvals": list(range(count)), "fixedrange": True,
+        "domain": [0, 0.062 * count + 0.02], "range": [count - 0.5, -0.5], "tickvals": list(range(count)), "fixedrange": True,
         "ticktext": [plain(label) for label in labels], "showgrid": False, "zeroline": False, "tickfont": {"size": 10},
     }  # fmt: skip
     return traces, rows

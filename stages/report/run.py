@@ -99,10 +99,15 @@ def _bars(
     bars: Trace = {
         "type": "bar", "orientation": "h", "y": [plain(row.stage) for row in rows], "x": [round(v, digits) for v in values],
         "marker": {"color": colour}, "hovertemplate": f"%{{y}}: %{{x}} {unit}<extra></extra>",
-        "text": [f"{v:.{digits}f}" for v in values], "textposition": "auto", "cliponaxis": False,
+        "text": [f"{v:.{digits}f}" for v in values], "textposition": "outside", "cliponaxis": False,
     }  # fmt: skip
     y_axis = {"autorange": "reversed", "showgrid": False, "ticks": "", "fixedrange": True}
     height = _BAR_PX * len(rows) + _AROUND_PX
     return Plot(
-        label, [bars], {"xaxis": axis(title), "yaxis": y_axis, "bargap": 0.3}, "bars", "", {"height": height}
+        label,
+        [bars],
+        {"xaxis": axis(title, range=[0, 1.16 * max(*values, 1e-3)]), "yaxis": y_axis, "bargap": 0.3},
+        "bars",
+        "",
+        {"height": height},
     )

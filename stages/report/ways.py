@@ -11,9 +11,11 @@ import numpy as np
 from scanloom.schemas.trajectory import Odometry, Poses
 from scanloom.stages.geometry.alignment import travelled
 from scanloom.stages.geometry.se3 import F8
-from scanloom.stages.report.plots import I8, Trace, fixed, short, thin
+from scanloom.stages.report.plots import I8, MOST_POINTS, Trace, fixed, short, thin
 
 DRIVEN = "distance driven, m"
+_MOST_OF_ALL, _LEAST_POINTS = 6000, 500
+"""Points that a curve of all sessions together has, and of each at least: a page of many sessions stays small."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,8 @@ class Way:
     stamp_ns: I8
     driven_m: F8
     place_m: F8
+    most: int = MOST_POINTS
+    """Points of a curve along it."""
 
     def __len__(self) -> int:
         return len(self.scan_index)
@@ -48,15 +52,16 @@ class Way:
 
 def ways(poses: Mapping[str, Poses], odometries: Mapping[str, Odometry]) -> dict[str, Way]:
     """By the map's poses; by odometry for sessions that have none."""
-    found = {name: _way(rows, rows.T_world_lidar) for name, rows in poses.items() if len(rows)}
+    most = min(max(_MOST_OF_ALL // max(len(poses), 1), _LEAST_POINTS), MOST_POINTS)
+    found = {name: _way(rows, rows.T_world_lidar, most) for name, rows in poses.items() if len(rows)}
     for name, rows in odometries.items():
         if name not in found and len(rows):
-            found[name] = _way(rows, rows.T_odom_lidar)
+            found[name] = _way(rows, rows.T_odom_lidar, most)
     return dict(sorted(found.items()))
 
 
-def _way(rows: Poses | Odometry, T: F8) -> Way:
-    return Way(rows.scan_index, rows.stamp_ns, travelled(T), T[:, :3, 3])
+def _way(rows: Poses | Odometry, T: F8, most: int) -> Way:
+    return Way(rows.scan_index, rows.stamp_ns, travelled(T), T[:, :3, 3], most)
 
 
 HOVER = "%{y:.3~g} UNIT<br>%{x:.1f} m driven, scan %{customdata[0]}<br>stamp %{customdata[1]:.2f} s<extra></extra>"
@@ -64,7 +69,7 @@ HOVER = "%{y:.3~g} UNIT<br>%{x:.1f} m driven, scan %{customdata[0]}<br>stamp %{c
 
 def curve(label: str, way: Way, rows: I8, y: F8, colour: str, unit: str, **more: Any) -> Trace:
     """Values y (n,) of scans of a way, thinned; hovering tells distance, scan and stamp."""
-    kept = thin(y)
+    kept = thin(y, way.most)
     at = rows[kept]
     return {
         "type": "scatter", "mode": "lines", "name": label, "x": fixed(way.driven_m[at]), "y": short(y[kept]),
