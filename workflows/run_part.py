@@ -47,7 +47,9 @@ def stage_times(result: Result) -> list[StageTime]:
     return [row for row in rows.values() if row.tasks]
 
 
-def changed_settings(settings: Overrides, of_sessions: Mapping[str, Overrides]) -> list[Changed]:
+def changed_settings(
+    settings: Overrides, of_sessions: Mapping[str, Mapping[str, Mapping[str, Any]]]
+) -> list[Changed]:
     """Settings whose value is not the default, of the whole run, then of single sessions."""
     rows = list(_differing("", settings))
     for name, own in of_sessions.items():
@@ -55,7 +57,7 @@ def changed_settings(settings: Overrides, of_sessions: Mapping[str, Overrides]) 
     return rows
 
 
-def _differing(session: str, layer: Overrides) -> Iterable[Changed]:
+def _differing(session: str, layer: Mapping[str, Mapping[str, Any]]) -> Iterable[Changed]:
     for name, model in resolve(NODES, [("settings", layer)]).items():
         for field in layer.get(name, {}):
             value, default = (
