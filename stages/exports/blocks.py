@@ -119,6 +119,17 @@ def split(rows: Rows, blocks: NDArray[np.int64]) -> dict[Block, Rows]:
     ends = np.append(starts[1:], len(rows))
     # Pieces of their own: a view would keep all the others in memory.
     return {
-        (int(low[0] + number[a] // width), int(low[1] + number[a] % width)): rows[order[a:b]]
+        (int(low[0] + number[a] // width), int(low[1] + number[a] % width)): picked(rows, order[a:b])
         for a, b in zip(starts, ends)
     }
+
+
+def picked(rows: Rows, at: NDArray[np.int64]) -> Rows:
+    """`rows[at]`, which numpy would copy field by field, as whole records."""
+    return rows.view(np.dtype((np.void, rows.dtype.itemsize)))[at].view(rows.dtype)
+
+
+def joined(parts: list[Rows]) -> Rows:
+    """Parts in sequence, as whole records."""
+    whole = np.dtype((np.void, parts[0].dtype.itemsize))
+    return np.concatenate([part.view(whole) for part in parts]).view(parts[0].dtype)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scanloom.stages.exports.blocks import Block, Grid, Pool, plan, split
+from scanloom.stages.exports.blocks import Block, Grid, Pool, joined, picked, plan, split
 from scanloom.stages.exports.clouds import box_of, cloud_of
 from scanloom.stages.exports.coordinates import Projector
 from scanloom.stages.exports.copc_file import CopcFile
@@ -78,25 +78,21 @@ class _Walk:
                 self._visit(level - 1, (2 * square[0] + x, 2 * square[1] + y))
         waiting, self._waiting[level] = self._waiting[level], []
         if waiting:
-            self._write_level(level, np.concatenate(waiting))
+            self._write_level(level, joined(waiting))
 
     def _block(self, block: Block) -> None:
         """Write what is finer than a block, keep the rest for later."""
         parts = self._pool.take(block)
         if not parts:
             return
-        rows = np.concatenate(parts)
+        rows = joined(parts)
         levels = self._octree.levels(places_of(rows), rows["level"])
-        order = np.argsort(levels, kind="stable")
-        rows, ends = rows[order], np.cumsum(np.bincount(levels, minlength=len(self._waiting)))
-        for level, end in enumerate(ends):
-            of_level = rows[end - np.count_nonzero(levels == level) : end]
-            if len(of_level) == 0:
-                continue
-            if level < self._octree.block_level:
+        for level in range(self._octree.top + 1):
+            of_level = picked(rows, np.flatnonzero(levels == level))
+            if len(of_level) and level < self._octree.block_level:
                 self._write_level(level, of_level)
-            else:
-                self._waiting[level].append(of_level.copy())
+            elif len(of_level):
+                self._waiting[level].append(of_level)
 
     def _write_level(self, level: int, rows: Rows) -> None:
         """All nodes of a level that these rows make."""

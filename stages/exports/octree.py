@@ -63,8 +63,8 @@ class Octree:
         """
         out = np.minimum(level, self.top).astype(np.uint8)
         leaves, leaf_of = _distinct(self.cells(places, 0))
-        counts = np.zeros((len(leaves), self.top + 1), np.int64)
-        np.add.at(counts, (leaf_of, out), 1)
+        many = self.top + 1
+        counts = np.bincount(leaf_of * many + out, minlength=len(leaves) * many).reshape(-1, many)
         for at in range(self.top, 0, -1):
             _, node_of = _distinct(leaves >> at)
             own = np.bincount(node_of, counts[:, at])
