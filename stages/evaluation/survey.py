@@ -145,7 +145,8 @@ def _squares(points: F4) -> I8:
         return np.empty(0, np.int64)
     column, row = np.floor(points[:, 0]).astype(np.int64), np.floor(points[:, 1]).astype(np.int64)
     column, row = column - column.min(), row - row.min()
-    return column * (row.max() + 1) + row
+    square: I8 = column * (row.max() + 1) + row
+    return square
 
 
 def _filled(square: I8) -> int:
