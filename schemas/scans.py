@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import ClassVar
@@ -72,6 +73,11 @@ class DeskewedScan(Cloud, Table):
     intensity: NDArray[np.float32] = column("f4", "strength of the return as the sensor reports it")
     reference_ns: int = attribute("time at which the LiDAR's frame is meant: the middle of the sweep, ns")
     scan_index: int = attribute("number of the scan in its session, from 0")
+    next_twist: Sequence[float] = attribute(
+        "motion to the next scan of the chunk where it was found by registration, else empty: six numbers, turn (rad/s) "
+        "and speed (m/s) of the LiDAR in its own frame",
+        default=(),
+    )
 
 
 class Scans(Stream[Scan]):

@@ -22,7 +22,7 @@ from scanloom.stages.geometry.neighbours import ThinScan, twist_between
 from scanloom.stages.geometry.rig import corrected
 from scanloom.stages.geometry.se3 import F8
 
-VERSION = 1
+VERSION = 2
 REMEMBERED_NS = 500_000_000
 
 
@@ -76,7 +76,8 @@ def _compensated(scans: Scans, track: MotionTrack, neighbours: _Neighbours | Non
     for scan, following in _with_next(scans):
         twist = neighbours.twist(scan, following) if neighbours else None
         x, y, z = compensate(scan.stamp_ns, scan.x_m, scan.y_m, scan.z_m, scan.reference_ns, track, twist)
-        yield _seen_at_once(scan, x, y, z)
+        found = neighbours.following if neighbours else None
+        yield _seen_at_once(scan, x, y, z, () if found is None else tuple(found.twist.tolist()))
 
 
 class Pair(NamedTuple):
@@ -92,7 +93,8 @@ class _Neighbours:
     def __init__(self, track: MotionTrack) -> None:
         self._track = track
         self._thin: ThinScan | None = None
-        self._before: Pair | None = None
+        self.following: Pair | None = None
+        """Of the last scan and the one after it, if they were registered."""
         self._last: Twists | None = None
 
     def twist(self, scan: Scan, following: Scan | None) -> Twists | None:
@@ -101,13 +103,13 @@ class _Neighbours:
         Each holds in the middle between its two scans: a motion that changes during the sweep is followed.
         """
         if self._told(scan) and (following is None or self._told(following)):
-            self._thin = self._before = None
+            self._thin = self.following = None
             return self._recent(scan)
-        before, after = self._before, self._pair(scan, following)
+        before, after = self.following, self._pair(scan, following)
         known = [pair for pair in (before, after) if pair is not None]
         if known:
             self._last = Twists(np.array([p.middle_ns for p in known]), np.array([p.twist for p in known]))
-        self._before = after
+        self.following = after
         return self._recent(scan)
 
     def _recent(self, scan: Scan) -> Twists | None:
@@ -121,7 +123,7 @@ class _Neighbours:
             return None
         near = self._thin if self._thin is not None else ThinScan.of(scan)
         self._thin = ThinScan.of(following)
-        guess = self._before.twist if self._before is not None else None
+        guess = self.following.twist if self.following is not None else None
         if guess is None and self._last is not None:
             guess = self._last.value[-1]
         twist = twist_between(near, self._thin, self._track, guess)
@@ -145,7 +147,8 @@ def _with_next(scans: Scans) -> Iterator[tuple[Scan, Scan | None]]:
         yield current, None
 
 
-def _seen_at_once(scan: Scan, x: F4, y: F4, z: F4) -> DeskewedScan:
+def _seen_at_once(scan: Scan, x: F4, y: F4, z: F4, next_twist: tuple[float, ...] = ()) -> DeskewedScan:
     return DeskewedScan(
-        x_m=x, y_m=y, z_m=z, intensity=scan.intensity, reference_ns=scan.reference_ns, scan_index=scan.scan_index
+        x_m=x, y_m=y, z_m=z, intensity=scan.intensity, reference_ns=scan.reference_ns, scan_index=scan.scan_index,
+        next_twist=next_twist,
     )  # fmt: skip

@@ -1,7 +1,8 @@
 """A scan among its neighbours: what lies in the scans shortly before and after it, and how the LiDAR moved between them.
 
 Scans stream through; a few before and a few after the present one are held. The motion comes from gyro and wheels
-where they are sound, else from registering each scan with the one before it; where that fails too it is unknown.
+where they are sound, else from registering each scan with the one before it, which deskew has done as a rule; where that
+fails too it is unknown.
 """
 
 from __future__ import annotations
@@ -132,7 +133,12 @@ class _Steps:
         if cover.rotation and cover.translation:
             self._thin = self._twist = None
             return self._track.relative(a_ns, b_ns)
-        return self._registered(before, view) if self._register else None
+        if not self._register:
+            return None
+        if len(before.scan.next_twist):  # deskew has registered the two
+            self._thin, self._twist = None, np.array(before.scan.next_twist, float)
+            return se3_exp(self._twist * (b_ns - a_ns) * 1e-9)
+        return self._registered(before, view)
 
     def _registered(self, before: View, view: View) -> F8 | None:
         near = self._thin or ThinScan.of(_standing(before.scan))

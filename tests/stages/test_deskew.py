@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from scanloom.schemas.scans import Scan, Scans
+from scanloom.schemas.scans import DeskewedScan, Scan, Scans
 from scanloom.schemas.session import Extrinsic, Session
 from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.stages.deskew import Settings, deskew
@@ -62,7 +62,7 @@ def run(
     imu: Imu | None = None,
     wheel: Wheel | None = None,
     **settings: object,
-) -> list[Scan]:
+) -> list[DeskewedScan]:
     out = deskew(Settings(**settings), Scans(scans), session, imu or Imu.empty(), wheel or Wheel.empty())
     return [*iter(out)]
 
@@ -126,6 +126,21 @@ def test_without_sensors_neighbours_tell_the_motion(speed: float) -> None:
         before, after = rms(scan.points() - exact(scan, twist)), rms(flat.points() - exact(scan, twist))
         assert 1e-4 < after < 0.05
         assert after < 0.25 * before
+
+
+def test_the_motion_that_was_registered_is_handed_on() -> None:
+    base = np.array([0, 0, np.radians(20), 15.0, 0, 0])
+    twist = adjoint(inverse(T_BASE_LIDAR)) @ base
+    scans, _ = moving_scans(twist, 4, street(1))
+    out = run(scans, make_session(mounted=True))
+    for flat in out[:-1]:
+        off = np.abs(np.array(flat.next_twist) - twist)
+        assert 0.0 < off[:3].max() < 0.02
+        assert 0.0 < off[3:].max() < 0.3
+    assert out[-1].next_twist == ()  # none follows
+    assert all(flat.next_twist == () for flat in run(scans, make_session(mounted=True), *sensors(base)))
+    assert all(flat.next_twist == () for flat in run(scans, make_session(), motion="none"))
+    assert all(flat.next_twist == () for flat in run(scans, make_session(), motion="sensors"))
 
 
 def test_a_turn_rate_that_changes_within_the_sweep_is_followed() -> None:

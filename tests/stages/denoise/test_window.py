@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import weakref
 from collections.abc import Iterator
 
@@ -13,7 +14,7 @@ from scanloom.schemas.tracks import Imu, Wheel
 from scanloom.stages.denoise.window import Moment, View, moments
 from scanloom.stages.geometry.motion import MotionTrack
 from scanloom.stages.geometry.range_image import ImageSettings, range_image
-from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.se3 import F8, se3_log
 from tests.stages.denoise.test_stage import make_session
 from tests.worlds import drive, relative, street
 
@@ -85,6 +86,29 @@ def test_where_sensors_are_silent_the_scans_tell_the_motion() -> None:
     without = around(scans, SILENT, 2, register=False)
     assert all(each.T_scan_neighbour is None for moment in without for each in moment.neighbours)
     assert not any(moment.known() for moment in without)
+
+
+def test_motion_that_deskew_registered_is_not_sought_again() -> None:
+    scans, poses = drive(street(0), 4, rows=4, columns=64, step_m=0.8)  # too few points to register
+    assert not any(moment.known() for moment in around(scans, SILENT, 2))
+    told = [
+        dataclasses.replace(scan, next_twist=tuple(10.0 * se3_log(relative(here, there))))
+        for scan, here, there in zip(scans, poses, poses[1:])
+    ]
+    told[1] = scans[1]
+    found = around([*told, scans[3]], SILENT, 2)
+    assert [[each.offset for each in moment.neighbours if each.T_scan_neighbour is not None] for moment in found] == [
+        [1], [-1], [1], [-1],
+    ]  # fmt: skip
+    for k, moment in enumerate(found):
+        for each in moment.neighbours:
+            if each.T_scan_neighbour is not None:
+                np.testing.assert_allclose(
+                    each.T_scan_neighbour, relative(poses[k], poses[k + each.offset]), atol=1e-9
+                )
+    assert not any(moment.known() for moment in around(told, SILENT, 2, register=False))
+    sensed = around(told, track_of(*sensors(poses)), 2)
+    assert all(len(moment.known()) == len(moment.neighbours) for moment in sensed)
 
 
 def test_a_pause_breaks_the_chain_of_motion() -> None:
