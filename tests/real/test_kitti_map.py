@@ -177,3 +177,106 @@ def test_nothing_is_exported_twice(exported: Path, kitti: Path) -> None:
         [sys.executable, "-m", "scanloom.workflows.cli", *words], capture_output=True, text=True, timeout=300
     )
     assert [row["fresh"] for row in json.loads(done.stdout)] == [False] * len(CLOUDS)
+
+
+OTHERS = ("tum", "kitti", "gpx", "geojson", "geoparquet", "dem", "orthophoto", "stac")
+
+
+@pytest.fixture(scope="module")
+def others(kitti: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map as everything that is no point cloud."""
+    for library in ("rasterio", "pystac"):
+        pytest.importorskip(library)
+    out = tmp_path_factory.mktemp("others")
+    words = ["export", str(kitti), "--format", ",".join(OTHERS), "--out", str(out)]
+    done = subprocess.run(
+        [sys.executable, "-m", "scanloom.workflows.cli", *words], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def trajectory_of(kitti: Path) -> np.ndarray:
+    """Stamp in s and position (n, 4) of every scan, in the map's frame."""
+    return np.loadtxt(kitti / "trajectory.tum")[:, :4]
+
+
+def test_text_trajectories_are_the_trajectory(others: Path, kitti: Path) -> None:
+    files = pytest.importorskip("evo.tools.file_interface")
+    (tum,) = (others / "tum").iterdir()
+    want = trajectory_of(kitti)
+    read = files.read_tum_trajectory_file(tum)
+    np.testing.assert_allclose(read.positions_xyz, want[:, 1:], rtol=0.0, atol=1e-6)
+    assert np.abs(read.timestamps - want[:, 0]).max() < 1e-6
+    matrices = files.read_kitti_poses_file(others / f"kitti/{tum.stem}.txt")
+    np.testing.assert_allclose(matrices.positions_xyz, want[:, 1:], rtol=0.0, atol=1e-6)
+
+
+def test_geographic_trajectories_are_one_and_the_same(others: Path, kitti: Path) -> None:
+    gpxpy, geopandas = pytest.importorskip("gpxpy"), pytest.importorskip("geopandas")
+    (segment,) = gpxpy.parse((others / "gpx/trajectory.gpx").read_text()).tracks[0].segments
+    track = np.array([(p.longitude, p.latitude, p.elevation) for p in segment.points])
+    (feature,) = json.loads((others / "geojson/trajectory.geojson").read_text())["features"]
+    line = np.array(feature["geometry"]["coordinates"])
+    np.testing.assert_allclose(line, track, rtol=0.0, atol=1e-8)
+    frame = geopandas.read_parquet(others / "geoparquet/trajectory.parquet")
+    assert frame.crs.to_epsg() == 32632
+    degrees = frame.geometry.to_crs(4326)
+    np.testing.assert_allclose(np.column_stack((degrees.x, degrees.y)), track[:, :2], rtol=0.0, atol=2e-9)
+    assert len(frame) == len(trajectory_of(kitti))
+    assert frame.sigma_position_m.between(0.01, 5.0).all()
+
+
+def test_heights_are_those_of_the_ground(others: Path, kitti: Path, placed: np.ndarray) -> None:
+    import rasterio
+
+    classes = [pq.read_table(path, columns=["class_"])["class_"].to_numpy() for path in tiles_of(kitti)]
+    ground = placed[np.concatenate(classes) == 1]
+    with rasterio.open(others / "dem/dem.tif") as dem, rasterio.open(others / "dem/dem_count.tif") as count:
+        assert dem.crs.to_epsg() == count.crs.to_epsg() == 32632
+        box = np.array(dem.bounds)
+        assert np.abs(box - [*ground.min(axis=0)[:2], *ground.max(axis=0)[:2]]).max() <= 0.25
+        counts, heights = count.read(1), dem.read(1)
+        row, column = (np.floor(v / 0.25).astype(int) for v in (box[3] - ground[:, 1], ground[:, 0] - box[0]))
+        here, sums = np.zeros(counts.shape, int), np.zeros(counts.shape)
+        np.add.at(here, (row, column), 1)
+        np.add.at(sums, (row, column), ground[:, 2])
+        assert counts.sum() == len(ground)
+        # A point within a hundredth of a millimetre of an edge may fall to either side.
+        same = here == counts
+        assert np.count_nonzero(~same) < 20
+        known = same & (counts > 0)
+        assert np.abs(heights[known] - sums[known] / here[known]).max() < 1e-3
+        filled = (counts == 0) & (heights != dem.nodata)
+        assert 0 < np.count_nonzero(filled) < np.count_nonzero(known)
+
+
+def test_intensities_are_those_of_the_sensor(others: Path, placed: np.ndarray) -> None:
+    import rasterio
+
+    with rasterio.open(others / "orthophoto/intensity_top.tif") as top:
+        box = np.array(top.bounds)
+        assert np.abs(box - [*placed.min(axis=0)[:2], *placed.max(axis=0)[:2]]).max() <= 0.25
+        numbers = top.read(1)
+        intensity = top.offsets[0] + top.scales[0] * numbers[numbers > 0].astype(float)
+        # KITTI's reflectances are from 0 to 1.
+        assert intensity.min() > -1e-6 and 0.5 < intensity.max() <= 1.0 + 1e-6
+        assert 0.1 < np.median(intensity) < 0.5
+
+
+def test_the_catalogue_lists_the_map(others: Path, kitti: Path, placed: np.ndarray) -> None:
+    import pystac
+
+    item = pystac.Item.from_file(str(others / "stac/item.json"))
+    assert item.properties["pc:count"] == len(placed)
+    assert item.properties["proj:code"] == "EPSG:32632"
+    low, high = np.split(np.array(item.properties["proj:bbox"]), 2)
+    assert (low <= placed.min(axis=0) + 1e-6).all() and (high >= placed.max(axis=0) - 1e-6).all()
+    assert np.abs(low - placed.min(axis=0)).max() < 1.0 and np.abs(high - placed.max(axis=0)).max() < 1.0
+    into_utm = Transformer.from_crs(4326, 32632, always_xy=True)
+    west, south = into_utm.transform(item.bbox[0], item.bbox[1])
+    assert np.abs(low[:2] - [west, south]).max() < 5.0
+    exported = {name for name in item.assets if name.startswith("exports/")}
+    assert {name.split("/")[1] for name in exported} == set(OTHERS) - {"stac"}
+    assert all(Path(asset.get_absolute_href()).is_file() for asset in item.assets.values())
+    assert {"map.ply", "report.html"} <= set(item.assets)
