@@ -120,7 +120,13 @@ def points_of(glb: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and places in the map (n, 3) of a content, the turn to y up taken back."""
     length = int.from_bytes(glb[12:16], "little")
     body = json.loads(glb[20 : 20 + length])
-    vertices = np.frombuffer(glb[28 + length :], VERTEX, body["accessors"][0]["count"])
+    count, first = body["accessors"][0]["count"], 28 + length
+    vertices = np.zeros(count, VERTEX)
+    for field in VERTEX.names or ():
+        kind = VERTEX[field]
+        column = np.frombuffer(glb, kind.base, count * int(np.prod(kind.shape, dtype=int)), first)
+        vertices[field] = column.reshape(count, *kind.shape)
+        first += column.nbytes
     matrix = np.array(body["nodes"][0]["matrix"], float).reshape(4, 4).T
     turned = vertices["position"].astype(float) @ matrix[:3, :3].T + matrix[:3, 3]
     return vertices, np.column_stack((turned[:, 0], -turned[:, 2], turned[:, 1]))

@@ -1,4 +1,4 @@
-"""Points as binary glTF 2.0: one interleaved buffer, small enough that a library would only wrap `struct`.
+"""Points as binary glTF 2.0: column after column, since some readers know no interleaved ones. A library would only wrap `struct`.
 
 Metadata follow 3D Tiles 1.1: EXT_structural_metadata says what the attributes mean.
 """
@@ -22,9 +22,20 @@ VERTEX = np.dtype(
         ("session", "<u2", 2),
     ]
 )
-"""32 bytes; every attribute starts at a multiple of four, so class, normal and session have padding behind them."""
+"""What is written of a point, 32 bytes. Elements of glTF start at multiples of four, so class, normal and session have
+padding behind them."""
 _FLOAT, _BYTE, _UNSIGNED_BYTE, _UNSIGNED_SHORT = 5126, 5120, 5121, 5123
 _ARRAY_BUFFER, _POINTS = 34962, 0
+_COLUMNS = (
+    ("POSITION", "position", _FLOAT, "VEC3"),
+    ("COLOR_0", "colour", _UNSIGNED_BYTE, "VEC4"),
+    ("_INTENSITY", "intensity", _FLOAT, "SCALAR"),
+    ("_CLASSIFICATION", "class", _UNSIGNED_BYTE, "SCALAR"),
+    ("_NORMAL", "normal", _BYTE, "VEC3"),
+    ("_SESSION", "session", _UNSIGNED_SHORT, "SCALAR"),
+)
+"""Attribute, field, type of a component, type of an element."""
+_NORMALIZED = ("COLOR_0", "_NORMAL")
 _CLASS = {
     "name": "Point",
     "properties": {
@@ -43,10 +54,10 @@ def glb(vertices: NDArray[Any], centre_m: tuple[float, float, float]) -> bytes:
     node's matrix, so positions stay as they were measured.
     """
     x, y, z = centre_m
-    binary = vertices.tobytes()
+    binary = b"".join(np.ascontiguousarray(vertices[field]).tobytes() for _, field, _, _ in _COLUMNS)
     body: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "scanloom"},
-        "extensionsUsed": ["EXT_structural_metadata"],
+        "extensionsUsed": ["EXT_structural_metadata", "KHR_materials_unlit"],
         "extensions": {
             "EXT_structural_metadata": {
                 "schema": {"id": "scanloom", "classes": {"point": _CLASS}},
@@ -64,49 +75,45 @@ def glb(vertices: NDArray[Any], centre_m: tuple[float, float, float]) -> bytes:
         "meshes": [{"primitives": [_primitive()]}],
         "materials": [{"extensions": {"KHR_materials_unlit": {}}}],
         "buffers": [{"byteLength": len(binary)}],
-        "bufferViews": [
-            {
-                "buffer": 0,
-                "byteLength": len(binary),
-                "byteStride": VERTEX.itemsize,
-                "target": _ARRAY_BUFFER,
-            }
-        ],
+        "bufferViews": _views(len(vertices)),
         "accessors": _accessors(vertices),
     }
-    body["extensionsUsed"].append("KHR_materials_unlit")
     text = json.dumps(body, separators=(",", ":")).encode()
     return _container(text + b" " * (-len(text) % 4), binary + b"\0" * (-len(binary) % 4))
 
 
 def _primitive() -> dict[str, Any]:
-    names = ("POSITION", "COLOR_0", "_INTENSITY", "_CLASSIFICATION", "_NORMAL", "_SESSION")
     return {
         "mode": _POINTS,
         "material": 0,
-        "attributes": {name: number for number, name in enumerate(names)},
+        "attributes": {name: number for number, (name, *_) in enumerate(_COLUMNS)},
         "extensions": {"EXT_structural_metadata": {"propertyAttributes": [0]}},
     }
 
 
+def _views(count: int) -> list[dict[str, Any]]:
+    """Where each column stands in the buffer."""
+    views: list[dict[str, Any]] = []
+    first = 0
+    for _, field, _, _ in _COLUMNS:
+        stride = VERTEX[field].itemsize
+        views.append(
+            {
+                "buffer": 0, "byteOffset": first, "byteLength": stride * count, "byteStride": stride, "target": _ARRAY_BUFFER,
+            }
+        )  # fmt: skip
+        first += stride * count
+    return views
+
+
 def _accessors(vertices: NDArray[Any]) -> list[dict[str, Any]]:
+    made: list[dict[str, Any]] = []
+    for number, (name, _, component, kind) in enumerate(_COLUMNS):
+        entry = {"bufferView": number, "componentType": component, "type": kind, "count": len(vertices)}
+        made.append(entry | {"normalized": True} if name in _NORMALIZED else entry)
     position = vertices["position"]
-
-    def accessor(field: str, component: int, kind: str, **more: Any) -> dict[str, Any]:
-        offset = VERTEX.fields[field][1] if VERTEX.fields else 0
-        return {
-            "bufferView": 0, "byteOffset": offset, "componentType": component, "type": kind, "count": len(vertices), **more,
-        }  # fmt: skip
-
-    bounds = {"min": position.min(axis=0).tolist(), "max": position.max(axis=0).tolist()}
-    return [
-        accessor("position", _FLOAT, "VEC3", **bounds),
-        accessor("colour", _UNSIGNED_BYTE, "VEC4", normalized=True),
-        accessor("intensity", _FLOAT, "SCALAR"),
-        accessor("class", _UNSIGNED_BYTE, "SCALAR"),
-        accessor("normal", _BYTE, "VEC3", normalized=True),
-        accessor("session", _UNSIGNED_SHORT, "SCALAR"),
-    ]
+    made[0] |= {"min": position.min(axis=0).tolist(), "max": position.max(axis=0).tolist()}
+    return made
 
 
 def _container(text: bytes, binary: bytes) -> bytes:

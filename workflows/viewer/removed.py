@@ -14,10 +14,8 @@ from scanloom.stages.exports.glb import VERTEX, glb
 from scanloom.stages.exports.nodes import Node
 from scanloom.stages.exports.source import MapSource
 from scanloom.stages.exports.tiles3d import map_tileset_of
+from scanloom.stages.geometry import ply
 
-PLY_VERTEX = np.dtype(
-    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("class", "u1")]
-)  # as tiling writes it
 ROOT_POINTS = 50_000
 MOST_PER_TILE = 200_000
 """Points of one tile that are shown; of more every n-th is."""
@@ -55,7 +53,7 @@ class Removed:
     @cached_property
     def _points(self) -> NDArray[Any]:
         if not self._path.exists():
-            return np.empty(0, PLY_VERTEX)
+            return np.empty(0, ply.VERTEX)
         with self._path.open("rb") as stream:
             count = 0
             for line in stream:
@@ -66,8 +64,8 @@ class Removed:
                     break
             start = stream.tell()
         if not count:
-            return np.empty(0, PLY_VERTEX)
-        return np.memmap(self._path, PLY_VERTEX, "r", start, (count,))
+            return np.empty(0, ply.VERTEX)
+        return np.memmap(self._path, ply.VERTEX, "r", start, (count,))
 
     @cached_property
     def _root(self) -> Node:
