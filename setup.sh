@@ -73,11 +73,22 @@ install_locked() {
     touch "$stamp"
 }
 
+have_browser() {
+    for name in chromium chromium-browser google-chrome google-chrome-stable chrome; do
+        command -v "$name" >/dev/null && return
+    done
+    return 1
+}
+
 have_libraries || apt_install $packages
 venv_is_sound || make_venv
 case $kind in
     run) [ -e "$(stamp_of dev requirements-dev.lock)" ] || install_locked run requirements.lock ;;
-    dev) install_locked dev requirements-dev.lock ;;
+    dev)
+        install_locked dev requirements-dev.lock
+        # Without a browser the tests of the viewer's page are skipped; everything else runs.
+        have_browser || (apt_install chromium) || say "no Chromium: the tests of the viewer's page will be skipped"
+        ;;
     *) say "unknown kind $kind: run or dev"; exit 2 ;;
 esac
 $venv/bin/scanloom warm
