@@ -8,7 +8,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -32,7 +32,6 @@ _ALWAYS = ("scanloom", "numpy", "pyproj", "pyarrow")
 log = logging.getLogger(__name__)
 
 Row = dict[str, Any]
-Started = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -131,6 +130,7 @@ def _export(source: MapSource, entry: Format, options: Options, place: Path) -> 
     known = read_record(place).get(entry.name, {})
     if known.get("made_from") == made_from and _as_recorded(folder, known):
         return Exported(entry.name, folder, known, fresh=False)
+    log.info("exporting %s: %s", entry.name, entry.doc)
     try:
         files = _write_beside(source, entry, options, folder)
     except OSError as error:
@@ -186,18 +186,20 @@ def _digest_of(body: Any) -> str:
 def _facts(source: MapSource, entry: Format, options: Options) -> Row:
     """What a reader of the record wants to know of the points."""
     projector = Projector.of(source, options)
-    return {
+    facts: Row = {
         "map": {"name": source.name, "version": source.header.get("version")},
-        "points": points_of(source, options),
         "crs": {
             "epsg": projector.epsg,
             "vertical_epsg": projector.vertical_epsg,
             "heights": projector.heights,
             "operation": projector.operation,
         },
-        "box_m": box_of(source, projector, options).tolist(),
         "what": entry.doc,
     }
+    if entry.cloud:
+        facts["points"] = points_of(source, options)
+        facts["box_m"] = box_of(source, projector, options).tolist()
+    return facts
 
 
 def _unrecorded(source: MapSource) -> dict[str, str]:

@@ -45,6 +45,8 @@ class Format:
     """Extra of this package that brings `needs`; None where everything is always there."""
     needs: tuple[str, ...] = ()
     """Modules that are not part of every installation."""
+    cloud: bool = False
+    """Whether it holds every point of the map, and with `removed` those that are left out."""
     lists_others: bool = False
     """Made from the other exports beside it, hence written after them."""
     version: int = 1
@@ -52,18 +54,29 @@ class Format:
 
 
 _ROWS: tuple[Format, ...] = (
-    Format("ply", "whole map with all columns, float32 from an offset", write_ply),
-    Format("pcd", "whole map as x y z intensity class, float32 from an offset", write_pcd),
-    Format("laz", "whole map as LAZ 1.4 with its coordinate system", write_laz, "las", ("laspy", "lazrs")),
+    Format("ply", "whole map with all columns, float32 from an offset", write_ply, cloud=True),
+    Format("pcd", "whole map as x y z intensity class, float32 from an offset", write_pcd, cloud=True),
+    Format(
+        "laz",
+        "whole map as LAZ 1.4 with its coordinate system",
+        write_laz,
+        "las",
+        ("laspy", "lazrs"),
+        cloud=True,
+    ),
     Format(
         "copc",
         "the same as COPC 1.0, to stream by level of detail",
         write_copc,
         "las",
         ("laspy", "lazrs"),
+        cloud=True,
     ),
     Format(
-        "autoware", "map folder of Autoware: PCD on a grid of 20 m and its place on the Earth", write_autoware
+        "autoware",
+        "map folder of Autoware: PCD on a grid of 20 m and its place on the Earth",
+        write_autoware,
+        cloud=True,
     ),
     Format("3dtiles", "whole map as 3D Tiles 1.1 with glTF contents, on the globe", write_3d_tiles),
     Format("tum", "trajectory as text of TUM, in the map's frame", write_tum),

@@ -220,6 +220,25 @@ def test_the_command_line_refuses(folder: Path, tmp_path: Path) -> None:
     assert early.returncode == 2 and not (tmp_path / "out").exists()
 
 
+def test_after_a_map(folder: Path) -> None:
+    from scanloom.workflows.build_map import Outcome
+    from scanloom.workflows.cli import _export_after
+
+    outcome = Outcome(
+        out=folder, exit_code=0, delivered=True, metrics=[], executed=1, warnings=[], failures=[]
+    )
+    assert _export_after(outcome, "") == []
+    assert [entry.name for entry in _export_after(outcome, "pcd,ply")] == ["pcd", "ply"]
+    assert _export_after(replace(outcome, delivered=False), "laz") == []
+    assert not (folder / "exports/laz").exists()
+
+
+def test_trajectories_have_no_points_on_record(folder: Path) -> None:
+    export_map(folder, "pcd,tum", Options())
+    assert "points" in read_record(folder / "exports")["pcd"]
+    assert "points" not in read_record(folder / "exports")["tum"]
+
+
 def test_the_list() -> None:
     listed = json.loads(run("export", "--list", "--json").stdout)
     assert {"ply", "pcd", "laz", "copc", "autoware"} <= {row["format"] for row in listed}

@@ -124,6 +124,19 @@ def test_a_level_is_the_map_thinned(tmp_path: Path) -> None:
     assert 2.0 < counts[1] / counts[0] < 4.5
 
 
+@pytest.mark.parametrize("corner", [(-70.0, 60.0, -5.0), (20.0, -30.0, 0.0), (5.0, 40.0, -1.0)])
+def test_a_box_is_found_by_the_octree(tmp_path: Path, corner: tuple[float, float, float]) -> None:
+    source = write(tmp_path / "m", clustered(13, 3000))
+    path = write_copc(source, tmp_path, Options())[0]
+    low = Projector.of(source, Options()).project(corner)[0]
+    high = low + np.array([22.0, 25.0, 12.0])
+    with laspy.CopcReader.open(str(path)) as reader:
+        found = reader.query(laspy.copc.Bounds(mins=low, maxs=high))
+    _, every = read(path)
+    inside = np.all((every >= low) & (every <= high), axis=1)
+    assert len(found) == inside.sum() > 100
+
+
 def test_one_point(tmp_path: Path) -> None:
     source = write(tmp_path / "m", np.array([[-0.5, -120.25, 3.0]]))
     _, points = read(write_copc(source, tmp_path, Options())[0])
