@@ -125,7 +125,7 @@ def _dots(label: str, way: Way, rows: NDArray[np.int64], y: F8, colour: str) -> 
     at = rows[kept]
     return {
         "type": "scatter", "mode": "markers", "name": label, "x": fixed(way.driven_m[at]),
-        "y": short(np.maximum(y[kept], _LEAST_RESIDUAL_M)), "customdata": way.told(at),
+        "y": short(np.maximum(y[kept], _LEAST_RESIDUAL_M)), "customdata": way.told(at), "meta": {"start_s": way.start_s},
         "marker": {"color": colour, "size": 5}, "hovertemplate": HOVER.replace("UNIT", "m"), "showlegend": True,
     }  # fmt: skip
 

@@ -74,6 +74,9 @@
 
   function data(figure) {
     const traces = themed(structuredClone(figure.spec.data));
+    for (const trace of traces) {
+      if (trace.meta) for (const told of trace.customdata) told[1] += trace.meta.start_s;
+    }
     return figure === tracks ? coloured(traces) : traces;
   }
 
@@ -146,7 +149,7 @@
   // --- pointing at a place marks it everywhere ----------------------------------------------------------------------
 
   function pointed(figure, point) {
-    if (figure === tracks && point.data.meta) show(point.data.meta, point.customdata[2]);
+    if (figure === tracks && point.data.meta) show(point.data.meta.session, point.customdata[2]);
     else if (figure.spec.kind === "along") show(figure.spec.session, point.x);
   }
 

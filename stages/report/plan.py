@@ -78,7 +78,7 @@ def _beads(name: str, way: Way, rows: I8, colour: str) -> Trace:
     return {
         "type": "scatter", "mode": "markers", "name": plain(name), "x": fixed(way.place_m[rows, 0]),
         "y": fixed(way.place_m[rows, 1]), "customdata": told, "text": plain(name), "hovertemplate": PLAN_HOVER,
-        "marker": {"size": 6, "color": colour}, "meta": name, "showlegend": False,
+        "marker": {"size": 6, "color": colour}, "meta": {"session": name, "start_s": way.start_s}, "showlegend": False,
     }  # fmt: skip
 
 

@@ -36,6 +36,11 @@ class Way:
     def length_m(self) -> float:
         return float(self.driven_m[-1]) if len(self) else 0.0
 
+    @property
+    def start_s(self) -> float:
+        """Stamp of the first scan."""
+        return round(int(self.stamp_ns[0]) * 1e-9, 2) if len(self) else 0.0
+
     def at_scans(self, scans: I8) -> I8:
         """Rows of scans (n,), by number; the next one where a scan has no pose."""
         return np.clip(np.searchsorted(self.scan_index, scans), 0, max(len(self) - 1, 0))
@@ -45,8 +50,8 @@ class Way:
         return np.clip(np.searchsorted(self.stamp_ns, stamps_ns), 0, max(len(self) - 1, 0))
 
     def told(self, rows: I8) -> list[list[Any]]:
-        """Number and stamp, s, of scans, as each point of a curve carries them."""
-        seconds = fixed(self.stamp_ns[rows] * 1e-9, 2)
+        """Number and time since `start_s` of scans, as each point of a curve carries them; the page adds the start."""
+        seconds = fixed((self.stamp_ns[rows] - self.stamp_ns[0]) * 1e-9, 2)
         return [list(pair) for pair in zip(self.scan_index[rows].tolist(), seconds)]
 
 
@@ -73,6 +78,6 @@ def curve(label: str, way: Way, rows: I8, y: F8, colour: str, unit: str, **more:
     at = rows[kept]
     return {
         "type": "scatter", "mode": "lines", "name": label, "x": fixed(way.driven_m[at]), "y": short(y[kept]),
-        "customdata": way.told(at), "line": {"color": colour, "width": 1.6}, "hovertemplate": HOVER.replace("UNIT", unit),
+        "customdata": way.told(at), "meta": {"start_s": way.start_s}, "line": {"color": colour, "width": 1.6}, "hovertemplate": HOVER.replace("UNIT", unit),
         "showlegend": True, **more,
     }  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from scanloom.stages.report.templates import asset
 from tests.logs import scan_folder
 
 
@@ -74,8 +76,21 @@ def test_metrics_have_name_value_unit_scope_method(mapped: Path) -> None:
 
 def test_report_is_one_self_contained_file(mapped: Path) -> None:
     page = (mapped / "out/report.html").read_text()
-    assert "http://" not in page.replace("http://www.w3.org", "") and "https://" not in page
-    assert 'src="data:' in page or "<svg" in page
+    library = asset("vendor/plotly-basic.min.js")
+    assert page.count(library) == 1
+    own = page.replace(library, "").replace("http://www.w3.org", "")
+    assert "http://" not in own and "https://" not in own
+    assert "default-src &#39;none&#39;; img-src data: blob:" in own
+    assert own.count('src="data:image/webp;base64,') == 3
+    assert own.count('<script type="application/json">') >= 5
+
+
+def test_report_tells_what_was_changed_and_what_the_map_was_made_of(mapped: Path) -> None:
+    page = (mapped / "out/report.html").read_text()
+    described = json.loads((mapped / "out/map.json").read_text())
+    assert described["files"]["map.ply"]["sha256"] in page
+    assert described["sessions"][0]["log"] in page
+    assert hashlib.sha256((mapped / "out/map.json").read_bytes()).hexdigest() in page
 
 
 def test_again_runs_no_stage_and_changes_no_byte(mapped: Path) -> None:

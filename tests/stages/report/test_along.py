@@ -158,7 +158,7 @@ def test_fixes_are_coloured_by_what_became_of_them() -> None:
     assert (dots["used"]["x"], dots["used"]["y"]) == ([0.0], [0.01])
     assert (dots["left out by a test"]["x"], dots["left out by a test"]["y"]) == ([2.0, 3.0], [1.0, 10.0])
     assert dots["switched off: contradicts the rest of the graph"]["x"] == [4.0]
-    assert dots["used"]["customdata"] == [[0, 1_700_000_000.0]]
+    assert (dots["used"]["customdata"], dots["used"]["meta"]) == ([[0, 0.0]], {"start_s": 1_700_000_000.0})
 
 
 def test_stretches_without_a_position_are_marked() -> None:
