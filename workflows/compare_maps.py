@@ -29,7 +29,8 @@ from scanloom.stages.geometry.se3 import F8, inverse
 from scanloom.workflows.delivery import MAP_FILE, MAP_FORMAT, read_map
 from scanloom.workflows.metric_changes import Change, Row, metric_changes, regressions
 from scanloom.workflows.noise import Noise, measured, read_noise
-from scanloom.workflows.sources import Sources, read_sources
+from scanloom.workflows.sessions import SIMULATED_SESSIONS
+from scanloom.workflows.sources import SourceOfSession, Sources, read_sources
 
 SAMPLES = 20_000
 """Points of each map whose nearest in the other is sought."""
@@ -48,9 +49,21 @@ class Side:
     sources: Sources | None
 
     @property
-    def sessions(self) -> dict[str, str]:
-        """Digest of the log of each session by its name; of a simulated one its name and nothing else."""
+    def logs(self) -> dict[str, str]:
+        """Digest of the log of each session by its name."""
         return {str(row["name"]): str(row.get("log", "")) for row in self.header["sessions"]}
+
+    @property
+    def sessions(self) -> dict[str, str]:
+        """What tells the logs of the sessions apart, by name: digests, and of simulated ones all that is simulated but the seed
+        of chance, so that runs with other noise are runs of the same log."""
+        rows = () if self.sources is None else self.sources.sessions
+        return self.logs | {row.name: _drive(row) for row in rows if row.word in SIMULATED_SESSIONS}
+
+
+def _drive(session: SourceOfSession) -> str:
+    told = {name: value for name, value in session.settings.get("simulate", {}).items() if name != "seed"}
+    return f"{session.word} {json.dumps(told, sort_keys=True)}"
 
 
 @dataclass(frozen=True)
@@ -283,7 +296,7 @@ def _circumstances(side: Side) -> Iterator[tuple[str, str]]:
     for name in ("voxel_size_m", "tile_size_m", "frame", "epsg", "version"):
         yield name, str(side.header.get(name))
     yield "sessions", ", ".join(sorted(side.sessions))
-    for name, log in side.sessions.items():
+    for name, log in side.logs.items():
         yield f"log of {name}", log[:16] or "simulated"
     if side.sources is None:
         return

@@ -336,3 +336,17 @@ def test_the_gate_holds_a_map_against_what_its_folder_held_before(tmp_path: Path
     assert worse_than(before, other, None) == []  # other logs say nothing
     assert as_it_was(tmp_path / "nowhere") is None
     assert worse_than(None, folder, None) == worse_than(before, tmp_path / "nowhere", None) == []
+
+
+@pytest.mark.parametrize(("changed", "code"), [({"seed": 7}, 5), ({"duration_s": 20.0}, 0)])
+def test_simulated_logs_that_differ_in_noise_alone_are_the_same_log(
+    tmp_path: Path, changed: dict[str, Any], code: int
+) -> None:
+    told = {"seed": 0, "duration_s": 10.0}
+    a = made(tmp_path / "a", rows(map__mme_r0__5_nat=-2.0), log="1" * 64)
+    b = made(tmp_path / "b", rows(map__mme_r0__5_nat=-1.0), log="2" * 64)
+    for folder, settings in ((a, told), (b, told | changed)):
+        session = {"name": "a", "word": "sample", "settings": {"simulate": settings}}
+        sources = {"format": "scanloom sources 1", "sessions": [session], "settings": {}, "store": ""}
+        (folder / "sources.json").write_text(json.dumps(sources))
+    assert compare_maps(a, b).exit_code == code
