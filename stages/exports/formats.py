@@ -121,7 +121,7 @@ def chosen(names: list[str]) -> list[Format]:
         if missing:
             raise UsageError(
                 f"the format {entry.name} needs {', '.join(missing)}, which is not installed",
-                next_step=f"pip install 'scanloom[{entry.extra}]'",
+                next_step=f"pip install 'scanloom[{entry.extra}]', in a checkout .venv/bin/pip install -e '.[{entry.extra}]'",
             )
     return found
 
