@@ -102,3 +102,12 @@ def test_removed_points_come_with_their_classes(tmp_path: Path, write_format) ->
     found = read(write_format(source, tmp_path, Options(removed=True))[0])["class"][:, 0]
     assert len(found) == 130
     assert np.bincount(found[100:], minlength=7)[3:].tolist() == [10, 10, 0, 10]
+
+
+@pytest.mark.parametrize("write_format", [write_ply, write_pcd])
+def test_an_empty_tile_among_others(tmp_path: Path, write_format) -> None:
+    source = write(tmp_path / "m", scattered(7, 400))
+    tile = source.tile("0_0")
+    tile.take(slice(0, 0)).write(tmp_path / "m/tiles/0_0.parquet")
+    found = read(write_format(source, tmp_path, Options())[0])
+    assert len(found["positions"]) == 400 - len(tile) > 0
