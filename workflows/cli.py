@@ -382,12 +382,16 @@ def compare(
             "--measure-noise", help="Write the noise of all maps given, at least three, to this file."
         ),
     ] = None,
+    report: Annotated[
+        Path | None, typer.Option("--report", help="Write the comparison as a page to this file, too.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Two maps side by side; exit code 5 when the second is worse by more than noise."""
     from scanloom.schemas.errors import UsageError
     from scanloom.workflows.compare_maps import compare_maps, noise_of
     from scanloom.workflows.comparison_text import text_of_comparison, text_of_noise
+    from scanloom.workflows.delivery import write_text
 
     if measure_noise is not None:
         found_noise = noise_of(maps)
@@ -399,6 +403,8 @@ def compare(
             f"{len(maps)} maps were given, not two", next_step="say scanloom compare MAP_A MAP_B"
         )
     found = compare_maps(maps[0], maps[1], noise or [])
+    if report is not None:
+        write_text(report, found.page())
     _emit(found.as_json()) if as_json else print(text_of_comparison(found))
     raise typer.Exit(found.exit_code)
 

@@ -26,6 +26,7 @@ from scanloom.stages.evaluation.difference import (
 from scanloom.stages.exports.source import MapSource
 from scanloom.stages.geometry.geodesy import between_worlds
 from scanloom.stages.geometry.se3 import F8, inverse
+from scanloom.stages.report.comparison import comparison_page
 from scanloom.workflows.delivery import MAP_FILE, MAP_FORMAT, read_map
 from scanloom.workflows.metric_changes import Change, Row, metric_changes, regressions
 from scanloom.workflows.noise import Noise, measured, read_noise
@@ -123,6 +124,10 @@ class Comparison:
             "settings": [vars(row) for row in self.settings],
             "sizes": [vars(row) for row in self.sizes],
         }
+
+    def page(self) -> str:
+        """As one self-contained page."""
+        return comparison_page(self.as_json(), f"{self.b.header['name']} against {self.a.header['name']}")
 
 
 def compare_maps(folder_a: Path, folder_b: Path, noise_from: Sequence[Path] = ()) -> Comparison:

@@ -350,3 +350,15 @@ def test_simulated_logs_that_differ_in_noise_alone_are_the_same_log(
         sources = {"format": "scanloom sources 1", "sessions": [session], "settings": {}, "store": ""}
         (folder / "sources.json").write_text(json.dumps(sources))
     assert compare_maps(a, b).exit_code == code
+
+
+def test_the_page_holds_everything_and_escapes_what_logs_say(tmp_path: Path) -> None:
+    a = made(tmp_path / "a", rows(map__mme_r0__5_nat=-2.0, map__points=5), name="<b>drive</b>")
+    b = made(tmp_path / "b", rows(map__mme_r0__5_nat=-1.0, map__points=5), name="<b>drive</b>")
+    target = tmp_path / "out" / "page.html"
+    done = CliRunner().invoke(app, ["compare", str(a), str(b), "--report", str(target)])
+    assert done.exit_code == 5
+    page = target.read_text()
+    assert "<b>drive</b>" not in page and "&lt;b&gt;drive" in page
+    assert "map.mme_r0.5_nat is worse than allowed" in page and "A to B" in page
+    assert "src=" not in page and "http" not in page
