@@ -82,7 +82,10 @@
 
   function draw(figure) {
     const full = layout(figure);
-    if (figure === tracks) full.images = background();
+    if (figure === tracks) {
+      full.images = background();
+      full.xaxis.showgrid = full.yaxis.showgrid = full.images.length === 0;
+    }
     if (figure.range) full.xaxis.range = figure.range;
     if (figure.drawn) { Plotly.react(figure.area, data(figure), full, CONFIG); return; }
     figure.drawn = true;

@@ -22,6 +22,8 @@ _RAMP = np.array(
 )
 """Colours from the ground up to `_TALL_M`."""
 _GREYS = np.array([[30, 34, 42], [128, 132, 138], [250, 250, 246]], float)
+_GAMMA = 0.65
+"""Below one lifts the dark ground, of which most of a map is."""
 CLASS_COLOURS = {PointClass.GROUND: (138, 122, 100), PointClass.STATIC: (92, 164, 208)}
 _OTHER_COLOUR = (200, 120, 200)
 """Of classes that a map does not usually hold."""
@@ -106,7 +108,7 @@ def _in_greys(
     glow: NDArray[np.float32], filled: NDArray[np.bool_], light: NDArray[np.float32]
 ) -> NDArray[np.uint8]:
     """Intensity: that of the ground where it lies open, else of the highest point."""
-    place = _stretch(glow, filled) * (len(_GREYS) - 1)
+    place = _stretch(glow, filled) ** _GAMMA * (len(_GREYS) - 1)
     i = np.minimum(place.astype(np.int64), len(_GREYS) - 2)
     share = (place - i)[..., None]
     colour = (_GREYS[i] * (1.0 - share) + _GREYS[i + 1] * share) * (0.4 + 0.6 * light)[..., None]

@@ -39,7 +39,7 @@ from scanloom.stages.report.loop_graph import loop_graph
 from scanloom.stages.report.map_picture import LAYERS, LEFT_OUT, OVERLAY, VIEW
 from scanloom.stages.report.moving import moving, share_chart
 from scanloom.stages.report.plan import track_plan
-from scanloom.stages.report.sentence import sentence
+from scanloom.stages.report.sentence import evidence, sentence
 from scanloom.stages.report.tables import headline_cards, metric_tables, tile_rows
 from scanloom.stages.report.templates import render
 from scanloom.stages.report.verdict import Limits, judge
@@ -103,11 +103,12 @@ def report(
     known = Known(paths, odometries, by_session(error_track), fixes, classes)
     on_way = ways(paths, odometries)
     figures = Figures(metrics)
-    verdict = judge(_limits(settings), sessions, figures, _gnss_medians(paths, fixes), graph)
+    medians = _gnss_medians(paths, fixes)
+    verdict = judge(_limits(settings), sessions, figures, medians, graph)
     body = render(
         "body.html",
         verdict=verdict,
-        sentence=sentence(verdict),
+        sentence=sentence(verdict, evidence(list(sessions), figures, list(medians.values()))),
         cards=headline_cards(sessions, figures),
         sessions=sessions,
         checks=by_session(check),
