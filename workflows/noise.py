@@ -45,9 +45,10 @@ class Noise:
     maps: tuple[str, ...]
 
     def tolerance(self, key: Key) -> float | None:
-        """How much worse a metric may be in another run without meaning anything; None for one that was not measured."""
+        """How much worse a metric may be in another run without meaning anything; None for one that was not measured, or that
+        did not vary: what happens once in ten runs, a scan that is lost, is not seen in three."""
         spread = self.spreads.get(key)
-        if spread is None or spread.repeats < LEAST_REPEATS:
+        if spread is None or spread.repeats < LEAST_REPEATS or spread.deviation == 0.0:
             return None
         return _student(spread.repeats - 1) * math.sqrt(2.0) * spread.deviation
 

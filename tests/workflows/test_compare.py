@@ -159,6 +159,15 @@ def test_noise_makes_run_times_judged_and_too_few_repeats_do_not() -> None:
     assert partly.tolerance(("loops.recall", "")) is None
 
 
+@pytest.mark.parametrize(("lost", "verdict"), [(5.0, "same"), (6.0, "regression")])
+def test_what_did_not_vary_in_the_repeats_has_the_default(lost: float, verdict: str) -> None:
+    noise = measured([("", rows(odometry__unreliable_scans=0.0))] * 3)
+    (change,) = metric_changes(
+        rows(odometry__unreliable_scans=0.0), rows(odometry__unreliable_scans=lost), noise
+    )
+    assert (change.verdict, change.source, change.allowed) == (verdict, "default", 5.0)
+
+
 def test_noise_is_written_and_read(tmp_path: Path) -> None:
     noise = measured(
         [(f"m{i}", rows(map__mme_r1_nat=v, map__tiles=4)) for i, v in enumerate((1.0, 1.2, 1.4))]
