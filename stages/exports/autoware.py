@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from scanloom.schemas.errors import UsageError
 from scanloom.stages.exports.blocks import Grid, Pool, Rows, plan
-from scanloom.stages.exports.clouds import cloud_of
+from scanloom.stages.exports.clouds import cloud_of, points_of
 from scanloom.stages.exports.coordinates import Projector
 from scanloom.stages.exports.options import Options
 from scanloom.stages.exports.pcd import header, rows
@@ -47,6 +47,7 @@ def write_autoware(source: MapSource, folder: Path, options: Options) -> list[Pa
             x, y = block[0] * CELL_M, block[1] * CELL_M
             corners[f"pointcloud_map_{x}_{y}.pcd"] = (x, y)
             _write_cell(folder / FOLDER / f"pointcloud_map_{x}_{y}.pcd", points)
+    pool.check_all_taken(points_of(source, options))
     (folder / LIST).write_text(_list(corners))
     (folder / PLACE).write_text(_place(projector))
     return [folder / LIST, folder / PLACE, *(folder / FOLDER / name for name in corners)]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from scanloom.schemas.errors import StageError
 from scanloom.stages.exports.clouds import part_boxes
 from scanloom.stages.exports.coordinates import Projector
 from scanloom.stages.exports.options import Options
@@ -74,6 +75,8 @@ class Pool:
         self._budget_bytes = budget_bytes
         self._waiting: OrderedDict[str, dict[Block, Rows]] = OrderedDict()
         self._bytes = 0
+        self.taken = 0
+        """Rows handed out so far."""
         self._blocks_left: dict[str, int] = {}
         for names in parts.values():
             for name in names:
@@ -86,11 +89,24 @@ class Pool:
             rows = self._pieces(name).pop(block, None)
             if rows is not None:
                 found.append(rows)
+                self.taken += len(rows)
                 self._bytes -= rows.nbytes
             self._blocks_left[name] -= 1
             if self._blocks_left[name] == 0:
                 self._drop(name)
         return found
+
+    def check_all_taken(self, points: int) -> None:
+        """
+        Raises
+        ------
+        StageError : fewer points were taken than the map has: some lie where the index of the map says there are none.
+        """
+        if self.taken != points:
+            raise StageError(
+                f"{points - self.taken} points of {points} lie outside the boxes that the index of tiles gives",
+                next_step="the folder of the map is damaged: run `scanloom map` again",
+            )
 
     def _pieces(self, name: str) -> dict[Block, Rows]:
         if name not in self._waiting:

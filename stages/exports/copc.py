@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.stages.exports.blocks import Block, Grid, Pool, joined, picked, plan, split
-from scanloom.stages.exports.clouds import box_of, cloud_of
+from scanloom.stages.exports.clouds import box_of, cloud_of, points_of
 from scanloom.stages.exports.coordinates import Projector
 from scanloom.stages.exports.copc_file import CopcFile
 from scanloom.stages.exports.las_points import SCALE_M, Records, Rows, places_of
@@ -32,8 +32,9 @@ def write_copc(source: MapSource, folder: Path, options: Options) -> list[Path]:
     octree = _octree(source, projector, options, records)
     path = folder / "map.copc.laz"
     out = CopcFile(path, projector, records, octree)
-    walk = _Walk(octree, _pool(source, projector, options, records, octree), out)
-    walk.run()
+    pool = _pool(source, projector, options, records, octree)
+    _Walk(octree, pool, out).run()
+    pool.check_all_taken(points_of(source, options))
     out.close()
     return [path]
 

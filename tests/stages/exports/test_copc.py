@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,9 @@ from hypothesis import given
 from hypothesis import settings as effort
 from hypothesis import strategies as st
 
+from scanloom.schemas.errors import StageError
 from scanloom.stages.exports import copc_file
+from scanloom.stages.exports.autoware import write_autoware
 from scanloom.stages.exports.coordinates import Projector
 from scanloom.stages.exports.copc import write_copc
 from scanloom.stages.exports.copc_file import ANOTHER_PAGE, ENTRY, pages_of
@@ -164,6 +167,15 @@ def test_an_empty_tile_among_others(tmp_path: Path) -> None:
     tile.take(slice(0, 0)).write(tmp_path / "m/tiles/0_0.parquet")
     _, points = read(write_copc(MapSource.open(tmp_path / "m"), tmp_path, Options())[0])
     assert len(points) == 400 - len(tile) > 0
+
+
+@pytest.mark.parametrize("write_format", [write_copc, write_autoware])
+def test_points_where_the_index_has_none_are_no_small_matter(tmp_path: Path, write_format) -> None:
+    source = write(tmp_path / "m", scattered(8, 400))
+    tile = source.tile("0_0")
+    replace(tile, offset_m=(0.0, 700.0, 0.0)).write(tmp_path / "m/tiles/0_0.parquet")
+    with pytest.raises(StageError, match=f"{len(tile)} points of 400"):
+        write_format(MapSource.open(tmp_path / "m"), tmp_path, Options())
 
 
 def test_little_memory_gives_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
