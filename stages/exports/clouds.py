@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from scanloom.schemas.errors import InvalidInput
 from scanloom.schemas.tiles import RemovedTile, Tile
 from scanloom.stages.exports.coordinates import Projector
 from scanloom.stages.exports.options import Options
@@ -51,7 +53,24 @@ class Cloud:
 def points_of(source: MapSource, options: Options) -> int:
     """How many points `clouds` gives: what the files hold, since headers of formats must agree with what follows."""
     files = (part_file(source, name) for name in part_names(source, options))
-    return sum(int(pq.read_metadata(path).num_rows) for path in files)
+    return sum(len(columns_of_file(path, [])) for path in files)
+
+
+def columns_of_file(path: Path, names: list[str]) -> pa.Table:
+    """Some columns of one of the map's files, without the check of the others; none of them for the number of rows alone.
+
+    Raises
+    ------
+    InvalidInput : the file is missing or damaged.
+    """
+    try:
+        return pq.read_table(path, columns=names)
+    except (OSError, pa.ArrowException) as error:
+        raise InvalidInput(
+            f"cannot be read ({error})",
+            where=str(path),
+            next_step="the folder of the map is damaged: run `scanloom map` again",
+        ) from error
 
 
 def clouds(source: MapSource, projector: Projector, options: Options) -> Iterator[Cloud]:

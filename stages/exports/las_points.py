@@ -8,12 +8,11 @@ from datetime import UTC, date, datetime
 from typing import Any, ClassVar
 
 import numpy as np
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from scanloom.schemas.scans import PointClass
 from scanloom.schemas.tiles import RemovedTile
-from scanloom.stages.exports.clouds import Cloud, part_file, part_names, round_offset_m
+from scanloom.stages.exports.clouds import Cloud, columns_of_file, part_file, part_names, round_offset_m
 from scanloom.stages.exports.coordinates import Projector
 from scanloom.stages.exports.options import Options
 from scanloom.stages.exports.source import MapSource
@@ -177,7 +176,7 @@ def _survey(source: MapSource, names: Iterable[str]) -> tuple[float, int, int]:
     """Highest intensity, earliest and latest stamp of all points, from two columns of each file."""
     strongest, first, last = 0.0, [], []
     for name in names:
-        table = pq.read_table(part_file(source, name), columns=["intensity", "first_ns"])
+        table = columns_of_file(part_file(source, name), ["intensity", "first_ns"])
         if table.num_rows:
             strongest = max(strongest, float(np.nanmax(table["intensity"].to_numpy(), initial=0.0)))
             stamps = table["first_ns"].to_numpy()

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scanloom.schemas.errors import InvalidInput, StoreError, UsageError
+from scanloom.schemas.errors import InvalidInput, ProductError, StoreError, UsageError
 from scanloom.stages.exports import formats
 from scanloom.stages.exports.options import Options
 from scanloom.workflows.export_map import export_map, options_of, read_record
@@ -179,6 +179,17 @@ def test_a_missing_library_names_its_extra(folder: Path, monkeypatch: pytest.Mon
 def test_not_a_map(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match="holds no map"):
         export_map(tmp_path, "pcd", Options())
+
+
+@pytest.mark.parametrize("name", ["ply", "pcd", "laz", "copc", "autoware"])
+@pytest.mark.parametrize("harm", [Path.unlink, lambda path: path.write_bytes(path.read_bytes()[:-9])])
+def test_a_map_with_a_broken_tile(folder: Path, name: str, harm) -> None:
+    if name in ("laz", "copc"):
+        pytest.importorskip("laspy")
+    harm(folder / "tiles/0_0.parquet")
+    with pytest.raises((InvalidInput, ProductError), match=r"0_0\.parquet"):
+        export_map(folder, name, Options())
+    assert sorted(p.name for p in (folder / "exports").iterdir()) == [".lock"]
 
 
 def test_a_file_where_the_folder_should_be(folder: Path) -> None:
