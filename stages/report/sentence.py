@@ -21,7 +21,7 @@ def sentence(verdict: Verdict, evidence: Sequence[str] = ()) -> str:
     if verdict.level not in ("fail", "warn"):
         passed = sum(check.level == "pass" for check in verdict.checks)
         told = _listed(evidence) if evidence else f"{number(passed)} check{'s' if passed != 1 else ''} passed"
-        return f"{opening}: no check warns, and {told}."
+        return f"{opening}: no check warns; {told}."
     worst = [check.text.rstrip(".") for check in verdict.checks if check.level == verdict.level]
     more = f" ({len(worst) - 1} more like this below)" if len(worst) > 1 else ""
     return f"{opening}: {worst[0]}{more}." if worst else f"{opening}."

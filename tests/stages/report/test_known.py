@@ -153,11 +153,11 @@ def test_the_sentence_names_the_worst_or_what_speaks_for_the_map() -> None:
     )
     assert (
         sentence(Verdict("Good", "pass", [fine]))
-        == "This map can be relied on: no check warns, and 1 check passed."
+        == "This map can be relied on: no check warns; 1 check passed."
     )
     told = ["its trajectory lies within 0.30 m of truth", "2 loops hold it together"]
     assert sentence(Verdict("Good", "note", [fine]), told).endswith(
-        f"no check warns, and {told[0]} and {told[1]}."
+        f"no check warns; {told[0]} and {told[1]}."
     )
     assert (
         sentence(Verdict("Fair", "warn", [odd, fine]), told)
