@@ -159,7 +159,7 @@ class App {
     const shown = this.cloud.shown;
     const removed = this.removed?.shown ? ` · ${number(this.removed.shown)} removed` : "";
     const failed = this.cloud.failed ? ` · ${this.cloud.failed} parts could not be read` : "";
-    $("count").textContent = `${number(shown)} of ${number(this.map.points)} points${removed}${this.cloud.busy ? " …" : ""}${failed}`;
+    $("count").textContent = `${number(shown)} of ${number(this.map.points)}${narrow() ? "" : " points"}${removed}${this.cloud.busy ? " …" : ""}${failed}`;
     const { isTop, perMetre, renderer } = this.view;
     $("scale").hidden = !isTop;
     if (!isTop) return;

@@ -84,7 +84,7 @@ export function pointRows(about) {
   const metres = (value) => `${value.toFixed(3)} m`;
   if (about.epsg) {
     rows.push(["Easting", metres(about.easting_m)], ["Northing", metres(about.northing_m)], ["Height (ellipsoid)", metres(about.height_m)]);
-    rows.push(["Latitude, longitude", `${about.latitude_deg.toFixed(8)}, ${about.longitude_deg.toFixed(8)}`]);
+    rows.push(["Latitude", `${about.latitude_deg.toFixed(8)}°`], ["Longitude", `${about.longitude_deg.toFixed(8)}°`]);
   }
   rows.push(["Map x, y, z", about.map_m.map((v) => v.toFixed(3)).join(", ")]);
   rows.push(["Class", about.class.replaceAll("_", " ")], ["Intensity", about.intensity.toPrecision(4)]);
