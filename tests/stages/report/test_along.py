@@ -256,6 +256,24 @@ def test_errors_lie_where_their_scans_were() -> None:
     assert [scan for scan, _ in fused["customdata"]] == [3, 4, 5]
 
 
+def test_a_session_that_is_not_in_the_map_is_shown_by_its_odometry() -> None:
+    paths, T = {"a": poses_of(road(11))}, road(21, 3.0)
+    on_way = ways(paths, {"a": odometry_of(road(11)), "b": odometry_of(T)})
+    assert list(on_way) == ["a", "b"]
+    assert (on_way["a"].length_m, on_way["b"].length_m) == (10.0, 60.0)
+    assert not blindness("b", odometry_of(T), session_of("b"), on_way["b"]).longest_m
+    assert ways({"a": Poses.empty(frame="map", georeference=None)}, {}) == {}
+
+
+def test_many_sessions_share_the_points_of_their_curves() -> None:
+    many = ways({f"s{k}": poses_of(road(5000)) for k in range(6)}, {})
+    odometry = replace(
+        odometry_of(road(5000)), degeneracy_e=np.random.default_rng(0).uniform(0.01, 0.02, 5000)
+    )
+    drawn = blindness("s0", odometry, session_of(), many["s0"]).plot.data[0]
+    assert 900 <= len(drawn["x"]) <= 1000
+
+
 # --- pose graph ---
 
 
