@@ -117,7 +117,7 @@
     const found = tracks.spec.colours.find((colour) => colour.key === (colourChoice ? colourChoice.value : ""));
     Object.entries(tracks.spec.beads).forEach(([session, number], k) => {
       const trace = traces[number];
-      if (!found) { trace.marker.size = 4; return; }
+      if (!found) return;
       const values = found.values[session] || trace.x.map(() => null);
       const scale = found.worse ? WORSE : "Viridis";
       trace.marker = {
