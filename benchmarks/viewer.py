@@ -108,7 +108,9 @@ def _zoomed(page: Page) -> float:
         " v.perspective.position.set(p.x, p.y - 5, p.z + 5); c.update(); scanloom.dirty = true; })()"
     )
     began = time.monotonic()
-    page.run("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => requestAnimationFrame(done))))")
+    page.run(
+        "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => requestAnimationFrame(done))))"
+    )
     page.wait(DONE, 300)
     return time.monotonic() - began
 

@@ -175,7 +175,7 @@ def _door(levels: Levels, tile: int, level: int) -> Node:
 
 def door_level(levels: Levels, root_points: int = ROOT_POINTS) -> int:
     """The coarsest level within the tiles; -1 where all levels are in blocks."""
-    return min(levels.of_tile, levels.root_level(root_points)) - 1
+    return min(max(levels.of_tile, 0), levels.root_level(root_points)) - 1
 
 
 def tile_nodes(

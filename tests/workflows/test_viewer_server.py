@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import http.client
 import json
+import socket
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -189,3 +191,22 @@ def test_lines_stand_where_they_were_driven(served: Server) -> None:
     assert np.allclose(car["path"][0], first, atol=2e-3)
     assert np.allclose(np.reshape(car["boxes"][0]["matrix"], (4, 4))[3, :3], first, atol=2e-3)
     assert car["boxes"][0]["size_m"] == [4.2, 1.8, 1.5]
+
+
+def test_a_damaged_tile_is_named_and_the_rest_is_served(tmp_path: Path) -> None:
+    make_map(tmp_path / "m")
+    (tmp_path / "m" / "tiles" / "0_0.parquet").write_bytes(b"PAR1 and then nothing")
+    with Running(tmp_path / "m") as server:
+        answer, body = ask(server, "/data/tileset/tiles/0_0.json")
+        assert answer.status == 500 and b"0_0.parquet" in body
+        assert ask(server, "/data/tileset/tiles/0_-1.json")[0].status == 200
+        assert ask(server, "/data/tileset/root.glb")[0].status == 200
+
+
+def test_a_browser_that_hangs_up_is_no_error(served: Server, caplog: pytest.LogCaptureFixture) -> None:
+    for _ in range(5):
+        with socket.create_connection((LOOPBACK, served.server_port)) as line:
+            line.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            line.sendall(f"GET /vendor.js HTTP/1.1\r\nHost: {LOOPBACK}:{served.server_port}\r\n\r\n".encode())
+    assert ask(served, "/")[0].status == 200
+    assert [record for record in caplog.records if record.levelname == "ERROR"] == []

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import mimetypes
+import sys
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from scanloom.schemas.errors import ScanloomError, UsageError
@@ -59,6 +61,12 @@ class Server(ThreadingHTTPServer):
                 f"port {port} cannot be used: {error.strerror}",
                 next_step="give another with --port, or --port 0 for any that is free",
             ) from error
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A browser that no longer wants an answer hangs up; that is no error."""
+        if isinstance(sys.exception(), ConnectionError):
+            return
+        _log.error("a request failed", exc_info=True)
 
     @property
     def url(self) -> str:

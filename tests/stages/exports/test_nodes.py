@@ -152,7 +152,7 @@ def test_a_map_of_small_tiles_has_no_doors() -> None:
 
 
 def test_rows_out_of_order_are_refused() -> None:
-    tiles = cut(scattered(9, 2_000, 20.0, 5.0) + (25.0, 25.0, 0.0))
+    tiles = cut(np.add(scattered(9, 2_000, 20.0, 5.0), (25.0, 25.0, 0.0)))
     levels = Levels.of(index_of(tiles))
     tile = tiles["0_0"]
     xyz = np.column_stack((tile.x_m, tile.y_m, tile.z_m)).astype(float)
