@@ -14,7 +14,7 @@ help:
 	@echo "make map [SESSION=log] [OUT=folder] [ARGS='--set odometry.voxel_size_m=0.4']   logs into a map"
 	@echo "make test     all tests          make check    style, types, import rules"
 	@echo "make nightly FLEET=fleet.yaml    many logs      make setup    only set up .venv"
-	@echo "make bench [BENCH=odometry|loops|fusion|extension|clean] [ARGS=...]   accuracy and speed against others; their packages: make bench-setup"
+	@echo "make bench [BENCH=odometry|loops|fusion|extension|clean|viewer] [ARGS=...]   accuracy and speed against others; their packages: make bench-setup"
 
 setup:
 	@./setup.sh run
