@@ -44,7 +44,7 @@ NOT_ASKED = 25
 CONTEXT_EDGES = np.array([-5.0, -4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
 AMONG_EDGES = np.array([3.0, 6.0, 10.0])
 
-SAMPLED, SAMPLES = 4, 12_000
+SAMPLED, SAMPLES = 4, 6_000
 """Of so many solid points one is looked at for its intensity; of fewer where a scan has more points than so many times that."""
 LEAST_IN_BAND = 100
 BRIGHT, BRIGHTER = 0.8, 12
@@ -71,7 +71,7 @@ WHOLE = np.uint64
 ZERO, TWICE, UNBENT = np.float32(0.0), np.float32(2.0), np.float32(1e9)
 BANDS_M = tuple(np.float32(edge) for edge in RANGE_EDGES_M)
 STEPS, LEAST_SHARE, MOST_ODDS = 6, 1e-5, 30.0
-LEAST_ODDS = -3.0
+LEAST_ODDS = -2.5
 """Neighbouring scans are not asked about points below this, nor are their surroundings: they cannot make up for it."""
 
 
@@ -92,7 +92,8 @@ def airborne(moment: Moment) -> B1:
         odds[asked] = first = log_odds(found, weights.FIRST)
     frame = view.frame
     around = context(
-        frame.place, frame.point, frame.stride, frame.away_m, view.scan.x_m, view.scan.y_m, view.scan.z_m, asked, odds
+        frame.place, frame.point, frame.range_m, frame.stride, frame.away_m, view.scan.x_m, view.scan.y_m, view.scan.z_m,
+        asked, odds,
     )  # fmt: skip
     flake = log_odds(found, weights.FLAKE) + weights.CONTEXT_FLAKE[around]
     cloud = log_odds(found, weights.CLOUD) + weights.CONTEXT_CLOUD[around]
@@ -233,12 +234,12 @@ def _sift(place: I4, away: F4, ranges: F4, classes: U1, intensity: F4, edges: F8
     for n in range(len(place)):  # written without a branch, which could not be foretold
         out[dim] = n
         dim += int((place[n] >= 0) & (not intensity[n] >= bright[WHOLE(_band(away[n]))]))
-    for n in out[:dim]:
-        r, k = away[n], place[n]
-        if classes[n] == GROUND and _bend(ranges[k + 1], ranges[k - 1], r) < NOISE_M + NOISE_PER_M * r:
-            continue
+    for m in range(dim):
+        n = out[m]
+        k, r = WHOLE(place[n]), away[n]
+        flat = _bend(ranges[k + WHOLE(1)], ranges[k - WHOLE(1)], r) < NOISE_M + NOISE_PER_M * r
         out[kept] = n
-        kept += 1
+        kept += int((classes[n] != GROUND) | (not flat))
     found = np.zeros((kept, KINDS), np.uint8)
     for m in range(kept):
         n = out[m]
@@ -278,7 +279,9 @@ def _shapes(place: I4, away: F4, ranges: F4, stride: int, asked: I8) -> U1:
 @kernel
 def _bend(a: float, b: float, r: float) -> float:
     """How far range `r` is off the line between its neighbours `a` and `b`: planes are straight in 1 / range."""
-    return abs(TWICE * a * b / (a + b) - r) if a > ZERO and b > ZERO else UNBENT  # type: ignore[return-value]
+    both = a * b
+    off = abs(TWICE * both / (a + b) - r)  # before it is asked whether there are two: so it is no branch
+    return off if both > ZERO else UNBENT  # type: ignore[return-value]
 
 
 @kernel
@@ -312,7 +315,9 @@ def log_odds(found: U1, table: F8) -> F4:
 
 
 @kernel
-def context(place: I4, point: I4, stride: int, away: F4, x: F4, y: F4, z: F4, asked: I8, odds: F4) -> U1:
+def context(
+    place: I4, point: I4, ranges: F4, stride: int, away: F4, x: F4, y: F4, z: F4, asked: I8, odds: F4
+) -> U1:  # fmt: skip
     """Bin (m,) of what the points around each of those `asked` say: their mean log-odds, and how many they are."""
     out, step = np.zeros(len(asked), np.uint8), WHOLE(stride)
     for m in range(len(asked)):
@@ -322,7 +327,10 @@ def context(place: I4, point: I4, stride: int, away: F4, x: F4, y: F4, z: F4, as
         first = WHOLE(place[n]) - step - WHOLE(4)
         for i in range(WHOLE(3)):
             for k in range(WHOLE(9)):
-                j = point[first + i * step + k]
+                at = first + i * step + k
+                if not abs(ranges[at] - away[n]) < near:  # no nearer than that: need not be looked up
+                    continue
+                j = point[at]
                 if j < 0 or j == n:
                     continue
                 dx, dy, dz = x[j] - x[n], y[j] - y[n], z[j] - z[n]

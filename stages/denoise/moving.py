@@ -30,6 +30,9 @@ U1 = NDArray[np.uint8]
 I4 = NDArray[np.int32]
 
 STATIC, GROUND = int(PointClass.STATIC), int(PointClass.GROUND)
+NOTHING, NOBODY, ZERO, ENDLESS = np.int32(0), np.int32(-1), np.float32(0.0), np.float32(np.inf)
+WHOLE = np.uint64
+"""Of cells that are looked up: a signed number is asked each time whether it counts from the end."""
 
 FEWEST_SCANS, LOOKS = 3, 3
 """A neighbour is at least so many scans away; so many of each side are asked, the farthest first."""
@@ -108,7 +111,7 @@ class Movers:
         return self._screens[index]
 
     def _forget(self, moment: Moment) -> None:
-        around = {each.view.scan.scan_index for each in moment.neighbours}
+        around = {each.scan.scan_index for each in (moment.view, *(n.view for n in moment.neighbours))}
         self._screens = {k: screen for k, screen in self._screens.items() if k in around}
 
 
@@ -193,7 +196,8 @@ def _nearest(point: I4, range_m: F4, classes: U1, half: int) -> F4:
     for v in range(rows):
         for u in range(columns):
             p = point[v, u]
-            wide[half + u] = range_m[v, u] if p >= 0 and classes[p] != GROUND else np.float32(np.inf)
+            stands = (p >= 0) & (classes[WHOLE(max(p, NOTHING))] != GROUND)
+            wide[WHOLE(half + u)] = range_m[v, u] if stands else ENDLESS
         for k in range(half):
             wide[k], wide[half + columns + k] = wide[columns + k], wide[half + k]
         row = along[v]
@@ -220,14 +224,21 @@ def _lower(one: F4, other: F4) -> None:
 def _thin(point: I4, range_m: F4, classes: U1, stride: int) -> tuple[I4, F4]:
     """The nearest STATIC point of every `stride` columns."""
     rows, columns = point.shape
-    out = np.full((rows, (columns + stride - 1) // stride), -1, np.int32)
-    ranges = np.zeros(out.shape, np.float32)
+    fewer = (columns + stride - 1) // stride
+    out, ranges = np.empty((rows, fewer), np.int32), np.empty((rows, fewer), np.float32)
+    row = np.full(fewer * stride, np.inf, np.float32)
     for v in range(rows):
-        for w in range(out.shape[1]):
-            for u in range(w * stride, min(w * stride + stride, columns)):
-                p = point[v, u]
-                if p >= 0 and classes[p] == STATIC and (out[v, w] < 0 or range_m[v, u] < ranges[v, w]):
-                    out[v, w], ranges[v, w] = p, range_m[v, u]
+        for u in range(columns):
+            p = point[v, u]
+            stands = (p >= 0) & (classes[WHOLE(max(p, NOTHING))] == STATIC)
+            row[WHOLE(u)] = range_m[v, u] if stands else ENDLESS
+        for w in range(fewer):
+            best, which = ENDLESS, NOTHING
+            for u in range(w * stride, w * stride + stride):
+                if row[WHOLE(u)] < best:
+                    best, which = row[WHOLE(u)], np.int32(u)
+            found = best < ENDLESS
+            out[v, w], ranges[v, w] = (point[v, which], best) if found else (NOBODY, ZERO)
     return out, ranges
 
 

@@ -30,7 +30,7 @@ from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.geometry.spacing import azimuth_step_rad
 from scanloom.stages.geometry.traction import without_slips
 
-VERSION = 3
+VERSION = 4
 
 U1 = NDArray[np.uint8]
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.stages.geometry.columns import standing
+from scanloom.stages.geometry.descent import solve
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.polar_grid import BINS, SECTORS, center, direction, extent, levelled
 from scanloom.stages.geometry.se3 import F8
@@ -41,6 +42,7 @@ FLOORED_SECTORS = 60
 """A floor is seen in a third of all directions."""
 FOOT_M = 0.05
 """Under something that stands on it the ground ends here above its height: what the noise of a range explains."""
+FIRST, UNKNOWN = np.int16(0), np.float32(np.nan)
 
 
 def ground_mask(x_m: F4, y_m: F4, z_m: F4, usable: B1, R_level_lidar: F8, height_m: float) -> B1:
@@ -78,18 +80,31 @@ def seed_plane(lowest: F8) -> F8 | None:
     if np.count_nonzero(ground) < SEED_CELLS:
         return None
     z = around[ground]
-    A = np.column_stack((np.ones(len(z)), x[ground], y[ground]))
     start = z.min() - 0.1
     count = np.convolve(np.bincount(((z - start) * 10.0).astype(np.int64)), (1, 2, 1), mode="same")
     plane = np.array([start + 0.1 * np.argmax(count) + 0.05, 0.0, 0.0])
+    fitted: F8 = _fitted(x[ground], y[ground], z, plane)
+    return fitted
+
+
+@kernel
+def _fitted(x: F8, y: F8, z: F8, plane: F8) -> F8:
+    """The plane (3,) z = a + b x + c y fitted to what lies ever closer to it."""
     for gate in FIT_GATES_M:
-        near = np.abs(z - A @ plane) < gate
-        if np.count_nonzero(near) < SEED_CELLS:
+        A, b, count = np.zeros((3, 3)), np.zeros(3), 0
+        for i in range(len(z)):
+            if abs(z[i] - (plane[0] + plane[1] * x[i] + plane[2] * y[i])) < gate:
+                row = (1.0, x[i], y[i])
+                for j in range(3):
+                    b[j] += row[j] * z[i]
+                    for k in range(3):
+                        A[j, k] += row[j] * row[k]
+                count += 1
+        if count < SEED_CELLS:
             break
-        B = A[near].T
-        fitted = np.linalg.lstsq(B @ B.T, B @ z[near], rcond=None)[0]
-        if np.hypot(fitted[1], fitted[2]) < STEEPEST:
-            plane = fitted
+        found = solve(A, b)
+        if np.sqrt(found[1] ** 2 + found[2] ** 2) < STEEPEST:
+            plane = found
     return plane
 
 
@@ -236,13 +251,15 @@ def _fill(height: F8, at_sensor: float) -> F8:
 @kernel
 def _above(cell: I2, forward: F4, left: F4, up: F4, height: F8, slope: F8) -> F4:
     """How far each point (n,) is above the ground, m; NaN where that is not known."""
-    out = np.full(len(cell), np.nan, np.float32)
-    heights, slopes = height.ravel(), slope.ravel()
+    start, rise = np.empty(SECTORS * BINS, np.float32), np.empty(SECTORS * BINS, np.float32)
+    for s in range(SECTORS):
+        for b in range(BINS):
+            start[s * BINS + b], rise[s * BINS + b] = height[s, b] - slope[s, b] * center(b), slope[s, b]
+    out = np.empty(len(cell), np.float32)
     for i in range(len(cell)):
-        if cell[i] >= 0:
-            away = np.sqrt(forward[i] * forward[i] + left[i] * left[i])
-            beyond = away - center(cell[i] % BINS)
-            out[i] = up[i] - (heights[cell[i]] + slopes[cell[i]] * beyond)
+        away, k = np.sqrt(forward[i] * forward[i] + left[i] * left[i]), max(cell[i], FIRST)
+        known = up[i] - (start[k] + rise[k] * away)
+        out[i] = known if cell[i] >= 0 else UNKNOWN
     return out
 
 

@@ -12,19 +12,16 @@ F4 = NDArray[np.float32]
 B1 = NDArray[np.bool_]
 I2 = NDArray[np.int16]
 
+ZERO, HALF, ONE, TWICE, THREE = (np.float32(c) for c in (0.0, 0.5, 1.0, 2.0, 3.0))
 SECTORS = 180
 NEAR_M, MIDDLE_M, FAR_M = 20.0, 50.0, 120.0
 BINS = 40 + 30 + 35
 """Cells of 0.5 m up to 20 m, of 1 m up to 50 m, of 2 m up to 120 m."""
 
 
-@kernel
-def bin_of(r: float) -> int:
-    if r < NEAR_M:
-        return int(r * 2.0)
-    if r < MIDDLE_M:
-        return 40 + int(r - NEAR_M)
-    return min(70 + int((r - MIDDLE_M) * 0.5), BINS - 1)
+NEAR, MIDDLE, FAR, NEAR_BINS, MIDDLE_BINS = (np.float32(c) for c in (NEAR_M, MIDDLE_M, FAR_M, 40, 70))
+SECTORS_PER_TURN, TINY = np.float32(0.25 * SECTORS), np.float32(1e-30)
+LAST_SECTOR, LAST_BIN, BINS_OF_SECTOR, NOWHERE = (np.int32(c) for c in (SECTORS - 1, BINS - 1, BINS, -1))
 
 
 @kernel
@@ -34,17 +31,6 @@ def center(b: int) -> float:
     if b < 70:
         return NEAR_M + (b - 40) + 0.5
     return MIDDLE_M + 2.0 * (b - 70) + 1.0
-
-
-@kernel
-def sector_of(x: float, y: float) -> int:
-    """Sector by the angle of a diamond, which rises with the azimuth and needs no arc tangent."""
-    norm = abs(x) + abs(y)
-    if norm == 0.0:
-        return 0
-    p = y / norm
-    turn = 1.0 + p if x >= 0.0 else 3.0 - p  # from -y in [0, 4)
-    return min(int(turn * (0.25 * SECTORS)), SECTORS - 1)
 
 
 @kernel
@@ -59,23 +45,29 @@ def direction(s: int) -> tuple[float, float]:
 
 @kernel
 def levelled(x: F4, y: F4, z: F4, usable: B1, R: F8) -> tuple[I2, F4, F4, F4]:
-    """For each point (n,) its cell, sector BINS + bin, -1 if it has none, and its coordinates turned by R (3, 3), m."""
-    cell = np.full(len(x), -1, np.int16)
+    """For each point (n,) its cell, sector BINS + bin, -1 if it has none, and its coordinates turned by R (3, 3), m.
+
+    A sector is told by the angle of a diamond, which rises with the azimuth and needs no arc tangent.
+    """
+    cell = np.empty(len(x), np.int16)
     forward, left, up = (
         np.empty(len(x), np.float32),
         np.empty(len(x), np.float32),
         np.empty(len(x), np.float32),
     )
-    for i in range(len(x)):
-        if not usable[i]:
-            continue
-        u = R[0, 0] * x[i] + R[0, 1] * y[i] + R[0, 2] * z[i]
-        v = R[1, 0] * x[i] + R[1, 1] * y[i] + R[1, 2] * z[i]
-        r = np.sqrt(u * u + v * v)
-        if r < FAR_M:
-            cell[i] = sector_of(u, v) * BINS + bin_of(r)
-            forward[i], left[i] = u, v
-            up[i] = R[2, 0] * x[i] + R[2, 1] * y[i] + R[2, 2] * z[i]
+    a, b, c = np.float32(R[0, 0]), np.float32(R[0, 1]), np.float32(R[0, 2])
+    d, e, f = np.float32(R[1, 0]), np.float32(R[1, 1]), np.float32(R[1, 2])
+    g, h, j = np.float32(R[2, 0]), np.float32(R[2, 1]), np.float32(R[2, 2])
+    for i in range(len(x)):  # all of it, and no branch, so that the compiler takes several points at once
+        u, v = a * x[i] + b * y[i] + c * z[i], d * x[i] + e * y[i] + f * z[i]
+        forward[i], left[i], up[i] = u, v, g * x[i] + h * y[i] + j * z[i]
+        r, norm = np.sqrt(u * u + v * v), abs(u) + abs(v)
+        p = v / max(norm, TINY)
+        turn = ONE + p if u >= ZERO else THREE - p  # from -y in [0, 4]
+        sector = min(np.int32(turn * SECTORS_PER_TURN), LAST_SECTOR)
+        near, middle, far = r * TWICE, NEAR_BINS + (r - NEAR), MIDDLE_BINS + (r - MIDDLE) * HALF
+        bins = min(np.int32(near if r < NEAR else (middle if r < MIDDLE else far)), LAST_BIN)
+        cell[i] = sector * BINS_OF_SECTOR + bins if usable[i] & (r < FAR) else NOWHERE
     return cell, forward, left, up
 
 
