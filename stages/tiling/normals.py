@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.stages.geometry.kernels import kernel
-from scanloom.stages.geometry.voxels import Int
 
 I8 = NDArray[np.int64]
 F8 = NDArray[np.float64]
@@ -21,8 +20,6 @@ REACH = 2
 LEAST_POINTS = 5
 FLAT = 0.25
 """A surface is thinner than half of its width: the least variance is below this share of the middle one."""
-SWEEPS = 6
-"""Of Jacobi rotations; three by three is done to machine precision after five."""
 
 
 def normals(key: I8, x_m: F8, y_m: F8, z_m: F8, view: I1, step_x: int, step_y: int, far_m: float) -> I1:
@@ -42,7 +39,7 @@ def _normals(key: I8, x: F8, y: F8, z: F8, view: I1, step_x: int, step_y: int, f
     out = np.zeros((len(key), 3), np.int8)
     width = 2 * REACH + 1
     first = np.zeros(width * width, np.int64)
-    S, V = np.empty((3, 3)), np.empty((3, 3))
+    normal = np.empty(3)
     for n in range(len(key)):
         count, sx, sy, sz = 0, 0.0, 0.0, 0.0
         xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -62,51 +59,53 @@ def _normals(key: I8, x: F8, y: F8, z: F8, view: I1, step_x: int, step_y: int, f
                 yy, yz, zz = yy + dy * dy, yz + dy * dz, zz + dz * dz
         if count < LEAST_POINTS:
             continue
-        S[0, 0], S[0, 1], S[0, 2] = xx - sx * sx / count, xy - sx * sy / count, xz - sx * sz / count
-        S[1, 1], S[1, 2], S[2, 2] = yy - sy * sy / count, yz - sy * sz / count, zz - sz * sz / count
-        S[1, 0], S[2, 0], S[2, 1] = S[0, 1], S[0, 2], S[1, 2]
-        thin = _thinnest(S, V)
-        if thin < 0:
+        share = 1.0 / count
+        if not _thinnest(
+            xx - sx * sx * share, xy - sx * sy * share, xz - sx * sz * share, yy - sy * sy * share,
+            yz - sy * sz * share, zz - sz * sz * share, normal,
+        ):  # fmt: skip
             continue
-        towards = V[0, thin] * view[n, 0] + V[1, thin] * view[n, 1] + V[2, thin] * view[n, 2]
+        towards = normal[0] * view[n, 0] + normal[1] * view[n, 1] + normal[2] * view[n, 2]
         scale = 127.0 if towards >= 0.0 else -127.0
         for k in range(3):
-            out[n, k] = np.rint(scale * V[k, thin])
+            out[n, k] = np.rint(scale * normal[k])
     return out
 
 
 @kernel
-def _thinnest(S: F8, V: F8) -> Int:
-    """Column of V, the eigenvectors of S (3, 3), that is normal to a surface; -1 where there is none. Jacobi's method."""
-    for i in range(3):
-        for j in range(3):
-            V[i, j] = 1.0 if i == j else 0.0
-    for _ in range(SWEEPS):
-        _rotate(S, V, 0, 1)
-        _rotate(S, V, 0, 2)
-        _rotate(S, V, 1, 2)
-    thin = 0
-    for k in range(1, 3):
-        if S[k, k] < S[thin, thin]:
-            thin = k
-    middle = np.inf
-    for k in range(3):
-        if k != thin:
-            middle = min(middle, S[k, k])
-    return thin if S[thin, thin] < FLAT * middle else -1
+def _thinnest(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, normal: F8) -> bool:
+    """Writes the unit eigenvector of the least eigenvalue into `normal` (3,), if that is the normal of a surface.
 
-
-@kernel
-def _rotate(S: F8, V: F8, p: int, q: int) -> None:
-    """Turns the axes p, q so that S[p, q] vanishes. Golub and Van Loan, section 8.5."""
-    if S[p, q] == 0.0:
-        return
-    theta = (S[q, q] - S[p, p]) / (2.0 * S[p, q])
-    t = (1.0 if theta >= 0.0 else -1.0) / (abs(theta) + np.sqrt(theta * theta + 1.0))
-    c = 1.0 / np.sqrt(t * t + 1.0)
-    s = t * c
+    Eigenvalues by trigonometry (Smith, Communications of the ACM 4, 1961); the eigenvector is orthogonal to the rows of
+    S - least I, hence along their longest cross product.
+    """
+    mean = (xx + yy + zz) / 3.0
+    a, b, c = xx - mean, yy - mean, zz - mean
+    p = np.sqrt((a * a + b * b + c * c + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
+    if p <= 0.0:
+        return False
+    det = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
+    angle = np.arccos(min(max(0.5 * det / (p * p * p), -1.0), 1.0)) / 3.0
+    most = mean + 2.0 * p * np.cos(angle)
+    least = mean + 2.0 * p * np.cos(angle + 2.0 * np.pi / 3.0)
+    if least >= FLAT * (3.0 * mean - most - least):
+        return False
+    a, b, c = xx - least, yy - least, zz - least
+    longest = 0.0
     for k in range(3):
-        S[k, p], S[k, q] = c * S[k, p] - s * S[k, q], s * S[k, p] + c * S[k, q]
+        if k == 0:
+            u, v, w = b * c - yz * yz, xz * yz - xy * c, xy * yz - xz * b
+        elif k == 1:
+            u, v, w = yz * xz - xy * c, a * c - xz * xz, xz * xy - a * yz
+        else:
+            u, v, w = xy * yz - b * xz, xy * xz - a * yz, a * b - xy * xy
+        square = u * u + v * v + w * w
+        if square > longest:
+            longest = square
+            normal[0], normal[1], normal[2] = u, v, w
+    if longest <= 0.0:
+        return False
+    scale = 1.0 / np.sqrt(longest)
     for k in range(3):
-        S[p, k], S[q, k] = c * S[p, k] - s * S[q, k], s * S[p, k] + c * S[q, k]
-        V[k, p], V[k, q] = c * V[k, p] - s * V[k, q], s * V[k, p] + c * V[k, q]
+        normal[k] *= scale
+    return True
