@@ -99,7 +99,9 @@ def test_the_overview_holds_the_coarsest_levels_that_fit(tiles: Parts[Tile]) -> 
             assert some.level.min() == kept
             assert len(some) == index.points[index.level >= kept].sum()
     _, least, _ = overview(Settings(overview_points=1), tiles)
-    assert len(least) == index.points[index.level == max(levels)].sum()  # of a map there is always something to see
+    assert (
+        len(least) == index.points[index.level == max(levels)].sum()
+    )  # of a map there is always something to see
 
 
 def test_points_of_the_overview_are_those_of_their_tiles(tiles: Parts[Tile]) -> None:
