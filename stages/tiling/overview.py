@@ -98,7 +98,7 @@ class Survey:
 
     name: str
     level: NDArray[np.int32]
-    """(levels,) that have points, coarsest first."""
+    """(levels,) that have points, coarsest first; of an empty tile the finest."""
     points: NDArray[np.int64]
     low_m: F8
     high_m: F8
@@ -107,12 +107,13 @@ class Survey:
 
 
 def _survey(name: str, tile: Tile) -> Survey:
-    starts = np.flatnonzero(np.diff(tile.level.astype(np.int32), prepend=-1))
+    levels = tile.level.astype(np.int32) if len(tile) else np.zeros(1, np.int32)
+    starts = np.flatnonzero(np.diff(levels, prepend=-1))
     runs = [tile.take(slice(a, b)) for a, b in zip(starts, [*starts[1:], len(tile)])]
-    low, high = zip(*map(_bounds, runs)) if runs else ([], [])
+    low, high = zip(*map(_bounds, runs))
     return Survey(
         name,
-        tile.level[starts].astype(np.int32),
+        levels[starts],
         np.array([len(run) for run in runs], np.int64),
         np.array(low, float).reshape(-1, 3),
         np.array(high, float).reshape(-1, 3),

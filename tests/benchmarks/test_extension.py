@@ -61,7 +61,8 @@ def _floor(height_m: float, seed: int) -> Piece:
     return Piece(
         voxel=np.arange(n), count=np.ones(n, np.int32), sum_x_m=x, sum_y_m=y,
         sum_z_m=height_m + rng.normal(0, 0.01, n), sum_intensity=np.zeros(n), ground_count=np.zeros(n, np.int32),
-        scan_count=np.ones(n, np.int32), frame="map", georeference=None, voxel_size_m=0.1, tile_size_m=50.0,
+        scan_count=np.ones(n, np.int32), first_ns=np.zeros(n, np.int64), last_ns=np.zeros(n, np.int64),
+        view=np.tile(np.int8([0, 0, 127]), (n, 1)), frame="map", georeference=None, voxel_size_m=0.1, tile_size_m=50.0,
     )  # fmt: skip
 
 

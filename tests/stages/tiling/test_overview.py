@@ -114,3 +114,14 @@ def test_points_of_the_overview_are_those_of_their_tiles(tiles: Parts[Tile]) -> 
         assert np.array_equal(whole.first_ns[rows], tile.first_ns)
     assert set(whole.sessions) == {"a"}
     assert sum(whole.row_groups()) == len(whole)
+
+
+def test_an_empty_tile_is_on_the_list(tiles: Parts[Tile]) -> None:
+    """So that a setting that empties a tile is seen to have altered it."""
+    empty = tiles[0].take(slice(0, 0))
+    index, cloud, files = overview(Settings(), tile_parts({"7_7": (empty, None), "0_0": (tiles[0], None)}))
+    row = index.by_tile()["7_7"]
+    assert index.points[row].tolist() == [0]
+    assert index.level[row].tolist() == [0]
+    assert len(cloud) == index.points.sum()
+    assert len(read_ply(files.read("map.ply"))) > 0
