@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from scanloom.schemas.clean import BRICK_VOXELS, Cleared
+from scanloom.schemas.clean import BRICK_VOXELS, Cleared, Standing
 from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import DeskewedScan
 from scanloom.stages.clean.field import I4, I8, brick_key, brick_table, inner, row_of, voxel_at
@@ -16,6 +16,7 @@ B1 = NDArray[np.bool_]
 F4 = NDArray[np.float32]
 U1 = NDArray[np.uint8]
 
+STANDS = int(Standing.STANDS)
 AHEAD_M = 150.0
 """Tiles within this distance of a scan are opened; farther ones are let go."""
 
@@ -40,6 +41,15 @@ class Verdicts:
             self._keys, self._rows, self._verdict,
         )  # fmt: skip
         return said
+
+    def around(self, scan: DeskewedScan, asked: B1, T_world_lidar: F8) -> U1:
+        """How many (n, 2) of the 26 voxels around the points that are asked stand, and moved or have changed."""
+        self._move_to(T_world_lidar[:2, 3])
+        counted: U1 = standing_around(
+            scan.x_m, scan.y_m, scan.z_m, asked, np.ascontiguousarray(T_world_lidar), 1.0 / self._voxel_m,
+            self._keys, self._rows, self._verdict,
+        )  # fmt: skip
+        return counted
 
     def _move_to(self, place: F8) -> None:
         low = self._tiles * self._size_m
@@ -75,4 +85,30 @@ def standing(
         row = row_of(keys, rows, brick_key(i, j, k))
         if row >= 0:
             out[n] = verdict[row, inner(i, j, k)]
+    return out
+
+
+@kernel
+def standing_around(
+    x: F4, y: F4, z: F4, asked: B1, T: F8, per_m: float, keys: I8, rows: I4, verdict: U1
+) -> U1:  # fmt: skip
+    """Voxels (n, 2) around that of each asked point that stand, and that moved or have changed."""
+    out = np.zeros((len(x), 2), np.uint8)
+    for n in range(len(x)):
+        if not asked[n]:
+            continue
+        i, j, k = voxel_at(float(x[n]), float(y[n]), float(z[n]), T, per_m)
+        own = brick_key(i, j, k)
+        own_row = row_of(keys, rows, own)
+        for q in range(27):
+            u, v, w = i + q // 9 - 1, j + q // 3 % 3 - 1, k + q % 3 - 1
+            key = brick_key(u, v, w)
+            row = own_row if key == own else row_of(keys, rows, key)
+            if row < 0 or q == 13:
+                continue
+            said = verdict[row, inner(u, v, w)]
+            if said == STANDS:
+                out[n, 0] += 1
+            elif said > STANDS:
+                out[n, 1] += 1
     return out

@@ -6,7 +6,7 @@ What the tracker saw drive about moved as well, wherever its box is; free space 
 nobody looked again. What is in the air is decided anew, with all that the map knows (`airborne`): dust was seen through before
 and after, too, and the tracker may have followed a cloud. What denoise took for a stray or for something that moves, and the
 map knows to stand, is restored. Own vehicle and range stay as they are, and ground, but for what of it is too high in a moving
-box.
+box, and for what was no ground but dust or snow close above it.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
 from scanloom.schemas.trajectory import Poses
 from scanloom.stages.clean import incidence
-from scanloom.stages.clean.airborne import Known, airborne
+from scanloom.stages.clean.airborne import Known, airborne, may_fly
 from scanloom.stages.clean.clusters import clusters
 from scanloom.stages.clean.lookup import Verdicts
 from scanloom.stages.clean.moving import MovingBoxes, boxed, number_of_box
 from scanloom.stages.geometry.se3 import F8
 
-VERSION = 2
+VERSION = 3
 
 U1 = NDArray[np.uint8]
 B1 = NDArray[np.bool_]
@@ -150,7 +150,10 @@ def final(settings: Settings, scan: DeskewedScan, classes: U1, known: _Map) -> U
     box = number_of_box(scan, boxes, settings.box_margin_m)
     near, around = box >= 0, boxed(scan, boxes, settings.wide_box_margin_m)
     if settings.particles:
-        fly = airborne(scan, Known(classes, said, box, around, cell, known.image), settings.apart_m)
+        asked = may_fly(scan, classes, said, cell, known.image)
+        beside = known.verdicts.around(scan, asked, T_world_lidar)
+        all_known = Known(classes, said, box, around, cell, known.image, asked, beside)
+        fly = airborne(scan, all_known, settings.apart_m)
     else:
         fly = (classes == AIRBORNE) & (said != Standing.STANDS) & ~near
     out = np.where(fly, AIRBORNE, _without_air(classes, said, near)).astype(np.uint8)

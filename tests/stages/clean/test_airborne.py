@@ -10,27 +10,24 @@ import pytest
 from scanloom.schemas.clean import Standing
 from scanloom.schemas.objects import ObjectTracks
 from scanloom.schemas.scans import PointClass, ScanLabels
-from scanloom.stages.clean import incidence, weights
+from scanloom.stages.clean import incidence, signs, weights
 from scanloom.stages.clean.airborne import (
     AFTERWARDS,
-    AIR,
     ASKED,
-    BOX,
-    FAR,
-    KINDS,
     NO_STRENGTH,
-    SCAN,
-    STRENGTH,
     TAKEN,
-    THING,
-    WHAT,
     Known,
     airborne,
     evidence,
+    is_loose,
     may_fly,
     strengths,
+    taken_next,
     things,
 )
+from scanloom.stages.clean.around import AIR, GROUND, OTHER, SOLID, over_ground, sticks_out
+from scanloom.stages.clean.field import brick_key, brick_table
+from scanloom.stages.clean.lookup import standing_around
 from scanloom.stages.clean.relabel import Settings
 from tests.stages.clean.worlds import Drive, car, cleared_of, drive_past, rays_of, relabelled, wall
 
@@ -159,29 +156,90 @@ def test_ground_and_what_both_agree_on_is_not_asked_about() -> None:
 
 
 def known_of(drive: Drive, said: np.ndarray) -> Known:
-    scan, n = drive.scans[0], len(drive.scans[0])
+    scan, n, classes = drive.scans[0], len(drive.scans[0]), drive.labels[0].class_
     image = incidence.new_image()
     cell = incidence.fill(scan.x_m, scan.y_m, scan.z_m, image)
-    return Known(drive.labels[0].class_, said, np.full(n, -1, np.int32), np.zeros(n, bool), cell, image)
+    asked = may_fly(scan, classes, said, cell, image)
+    none = np.full(n, -1, np.int32), np.zeros(n, bool)
+    return Known(classes, said, *none, cell, image, asked, np.zeros((n, 2), np.uint8))
 
 
 def test_evidence_stays_within_its_tables() -> None:
     drive, _ = in_dust(5, 0.5, count=1)
     rng = np.random.default_rng(0)
-    known = known_of(drive, rng.integers(0, 4, len(drive.scans[0])).astype(np.uint8))
-    asked = np.flatnonzero(may_fly(known.classes, known.said))
+    scan = drive.scans[0]
+    known = known_of(drive, rng.integers(0, 4, len(scan)).astype(np.uint8))
+    known = replace(known, near=rng.integers(0, 27, (len(scan), 2)).astype(np.uint8))
+    asked, loose = np.flatnonzero(known.asked), is_loose(known)
     taken = TAKEN[known.said, known.classes]
-    strength = strengths(drive.scans[0], known, asked)
-    found = evidence(drive.scans[0], known, things(drive.scans[0], known, 0.4), strength, taken, asked)
-    assert found.shape == (len(asked), KINDS)
+    thing, strength = things(scan, known, loose, 0.4), strengths(scan, known)
+    found = evidence(scan, known, thing, loose, strength, taken, asked)
+    assert found.shape == (len(asked), signs.KINDS)
     assert found.max() < weights.BINS
-    assert found[:, STRENGTH].max() < NO_STRENGTH
-    assert len(np.unique(found[:, WHAT])) >= 5
-    assert found[:, THING].max() <= 34
-    assert found[:, FAR].max() <= 14
-    assert (found[:, BOX] == 6).all()
-    assert len(np.unique(found[:, SCAN])) == 1
+    assert len(np.unique(found[:, signs.WHAT])) >= 5
+    assert found[:, signs.THING].max() <= 34
+    assert found[:, signs.FAR].max() <= 14
+    assert set(np.unique(found[:, signs.BOX])) <= {12, 13}
+    assert len(np.unique(found[:, signs.WEATHER])) == 1
+    assert len(np.unique(found[:, signs.NEAR_STANDS] // signs.CLASSES)) == 5
     assert (taken == AIR).sum() > 10
+
+
+def test_ground_is_made_of_no_thing_and_stays_ground_when_it_does_not_fly() -> None:
+    drive, _ = in_dust(5, 0.5, count=1)
+    drive.labels[0].class_[:] = PointClass.STATIC
+    drive.labels[0].class_[:10] = PointClass.GROUND
+    known = known_of(drive, np.where(np.arange(len(drive.scans[0])) < 15, 0, 1).astype(np.uint8))
+    assert not is_loose(known)[:10].any()
+    assert not is_loose(known)[15:].any()
+    rows = np.array([0, 1, 12, 13, 20])
+    after = taken_next(known, rows, np.array([True, False, True, False, False]))
+    assert after.tolist() == [AIR, GROUND, AIR, OTHER, SOLID]
+
+
+def test_what_is_nearer_than_both_its_neighbours_sticks_out() -> None:
+    angle = np.radians(np.arange(-5.0, 6.0) * 0.35)
+    for off, is_out in ((0.25, False), (0.35, True)):
+        r = np.full(11, 10.0)
+        r[5] -= off
+        x, y = (r * np.cos(angle)).astype(np.float32), (r * np.sin(angle)).astype(np.float32)
+        image = incidence.new_image()
+        cell = incidence.fill(x, y, np.zeros_like(x), image)
+        for class_ in (PointClass.GROUND, PointClass.STATIC, PointClass.EGO, PointClass.OUT_OF_RANGE):
+            found = sticks_out(x, y, np.zeros_like(x), np.full(11, class_, np.uint8), cell, image)
+            counted = class_ in (PointClass.GROUND, PointClass.STATIC)
+            assert found.tolist() == [is_out and counted and n == 5 for n in range(11)]
+
+
+def test_ground_is_asked_about_under_what_is_in_the_air_close_by() -> None:
+    """At 10 m, 0.9 m is near; the image holds 4 cells of 0.35 degrees to each side."""
+    angle = np.radians([0.0, 0.7, 1.2, 2.5, 0.7])
+    r = np.array([10.0, 10.0, 10.95, 10.0, 10.0])
+    x, y = (r * np.cos(angle)).astype(np.float32), (r * np.sin(angle)).astype(np.float32)
+    z = np.array([0.0, 0.0, 0.0, 0.0, -0.1], np.float32)
+    classes = np.full(5, PointClass.GROUND, np.uint8)
+    classes[0], classes[4] = PointClass.AIRBORNE, PointClass.STATIC
+    image = incidence.new_image()
+    cell = incidence.fill(x, y, z, image)
+    assert over_ground(x, y, z, classes, cell, image, classes == PointClass.AIRBORNE).tolist() == [
+        False, True, False, False, False,
+    ]  # fmt: skip
+    assert not over_ground(x, y, z, classes, cell, image, np.zeros(5, bool)).any()
+
+
+def test_standing_and_gone_voxels_around_are_counted_across_bricks_without_the_own() -> None:
+    verdict = np.zeros((2, 8, 8, 8), np.uint8)
+    verdict[0, 7, 3, 3], verdict[0, 7, 4, 3], verdict[0, 6, 3, 3] = (
+        Standing.STANDS,
+        Standing.MOVED,
+        Standing.STANDS,
+    )
+    verdict[1, 0, 3, 3], verdict[1, 1, 3, 3] = Standing.STANDS, Standing.CHANGED
+    keys, rows = brick_table(np.array([brick_key(0, 0, 0), brick_key(8, 0, 0)], np.int64), 2)
+    x, y, z = (np.array([each, each], np.float32) for each in (1.7, 0.7, 0.7))
+    asked = np.array([True, False])
+    said = standing_around(x, y, z, asked, np.eye(4), 5.0, keys, rows, verdict.reshape(2, 512))
+    assert said.tolist() == [[1, 2], [0, 0]]
 
 
 @pytest.mark.parametrize("intensity", [0.0, np.nan])
@@ -189,7 +247,7 @@ def test_a_sensor_that_tells_no_intensity_is_not_asked_for_it(intensity: float) 
     drive, _ = in_dust(6, 0.5, count=1)
     scan = replace(drive.scans[0], intensity=np.full(len(drive.scans[0]), intensity, np.float32))
     known = known_of(drive, np.ones(len(scan), np.uint8))
-    assert (strengths(scan, known, np.arange(len(scan))) == NO_STRENGTH).all()
+    assert (strengths(scan, known) == NO_STRENGTH).all()
     assert airborne(scan, known, 0.4).shape == (len(scan),)
 
 
@@ -198,7 +256,7 @@ def test_an_intensity_that_is_rounded_off_tells_nothing() -> None:
     scan, dust = drive.scans[0], dusty[0]
     known = known_of(drive, np.where(dust, 0, 1).astype(np.uint8))
     rows = np.flatnonzero(dust)
-    assert (strengths(scan, known, rows) < NO_STRENGTH).all()
+    assert (strengths(scan, known)[rows] < NO_STRENGTH).all()
     rounded = scan.intensity.copy()
     rounded[dust], rounded[np.flatnonzero(~dust)[::16]] = 0.0, 0.0
-    assert (strengths(replace(scan, intensity=rounded), known, rows) == NO_STRENGTH).all()
+    assert (strengths(replace(scan, intensity=rounded), known)[rows] == NO_STRENGTH).all()
