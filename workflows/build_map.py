@@ -181,7 +181,8 @@ def _measured(order: Order, result: Result) -> list[Metric]:
     peak_mb = max(result.peak_rss_mb, psutil.Process(os.getpid()).memory_info().rss / 1e6)
 
     def row(name: str, value: float, unit: str, method: str) -> Metric:
-        return {"name": name, "value": round(value, 3), "unit": unit, "scope": "run", "method": method}
+        rounded = round(value, 3) if abs(value) >= 1.0 else float(f"{value:.4g}")
+        return {"name": name, "value": rounded, "unit": unit, "scope": "run", "method": method}
 
     return [
         row("run.wall_s", wall_s, "s", "from the start of the command to the delivery of the map"),

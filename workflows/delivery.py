@@ -223,7 +223,10 @@ def _description(result: Result, label: Label) -> dict[str, Any]:
         for name, s in _by_name(result)
         if name in mapped
     ]
-    bounds = (index.min_m.min(axis=0), index.max_m.max(axis=0)) if len(index) else (np.zeros(3), np.zeros(3))
+    filled = index.take(index.points > 0)
+    bounds = (
+        (filled.min_m.min(axis=0), filled.max_m.max(axis=0)) if len(filled) else (np.zeros(3), np.zeros(3))
+    )
     return {
         "format": MAP_FORMAT,
         "name": label.name,
