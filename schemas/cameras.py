@@ -1,0 +1,85 @@
+"""Cameras: what a lens does to a ray, where a camera stands, and its images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from scanloom.schemas.product import Document, Stream, Table, attribute, column
+from scanloom.schemas.session import Matrix4
+
+Lens = Literal["pinhole", "radial-tangential", "equidistant"]
+COEFFICIENTS: dict[str, tuple[int, ...]] = {
+    "pinhole": (0,),
+    "radial-tangential": (4, 5, 8),
+    "equidistant": (4,),
+}
+"""How many distortion coefficients a lens may have."""
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class CameraModel(_Entry):
+    """Intrinsics. Pixel (0, 0) is the centre of the upper left pixel; u to the right, v down."""
+
+    lens: Lens
+    width_px: int = Field(gt=0)
+    height_px: int = Field(gt=0)
+    fx_px: float = Field(gt=0)
+    fy_px: float = Field(gt=0)
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, ...] = ()
+    """radial-tangential: k1 k2 p1 p2 [k3 [k4 k5 k6]]; equidistant: k1 k2 k3 k4 (Kannala and Brandt 2006)."""
+
+
+class Camera(_Entry):
+    """One camera of a rig. Its own axes: x right, y down, z forward."""
+
+    name: str
+    model: CameraModel
+    T_lidar_camera: Matrix4 | None = None
+    """Takes camera coordinates to the LiDAR's; null when nobody knows."""
+    source: str = ""
+    """Where the numbers come from: `camera info`, `calibration`, `kitti calibration`, `tf`, ..."""
+    clock_offset_s: float = 0.0
+    """How much later its stamps are than the LiDAR's clock; to be subtracted."""
+    readout_s: float = Field(0.0, ge=0.0)
+    """From the first row to the last of a rolling shutter, 0 for a global one; an image's stamp is its middle."""
+
+
+class Cameras(Document):
+    """The cameras of a session; empty where it has none, or none whose model is known."""
+
+    NAME: ClassVar[str] = "cameras"
+
+    cameras: tuple[Camera, ...] = ()
+    remarks: tuple[str, ...] = ()
+    """What was found odd, in sentences."""
+
+
+@dataclass(frozen=True)
+class Image(Table):
+    """One image as the log holds it, still encoded; raw ones are packed without loss."""
+
+    NAME: ClassVar[str] = "image"
+
+    data: NDArray[np.uint8] = column("u1", "bytes of the encoded image, as in a file")
+    stamp_ns: int = attribute("when the middle of it was exposed, on the LiDAR's clock, ns")
+    camera: str = attribute("name of its camera")
+    encoding: str = attribute("`png` or `jpeg`")
+    topic: str = attribute("topic or folder it came from")
+
+
+class Images(Stream[Image]):
+    """Images of one stretch of a session, in order of time."""
+
+    NAME = "images"
+    SPLIT_BY = "footage"
+    ITEM = Image
