@@ -13,7 +13,7 @@ Matrix6 = tuple[tuple[float, float, float, float, float, float], ...]
 
 
 class _Entry(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="constants")
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class Certainty(_Entry):
@@ -52,10 +52,10 @@ class Sighting(_Entry):
     corners: int = 0
     corner_sigma_px: float = 0.0
     """Scatter of the corners about the best flat board in this image alone."""
-    residual_px: float = float("nan")
+    residual_px: float | None = None
     """Root mean square distance of the corners from the LiDAR's board, by the final calibration."""
-    leave_one_out_px: float = float("nan")
-    leave_one_out_cm: float = float("nan")
+    leave_one_out_px: float | None = None
+    leave_one_out_cm: float | None = None
 
 
 class Placement(_Entry):
@@ -65,9 +65,9 @@ class Placement(_Entry):
     used: bool
     reason: str = ""
     """Why it was left out."""
-    distance_m: float = float("nan")
+    distance_m: float | None = None
     """From the LiDAR to the board."""
-    tilt_deg: float = float("nan")
+    tilt_deg: float | None = None
     """Between the board's normal and the line of sight of the LiDAR."""
     board_points: int = 0
     edge_points: int = 0
