@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from scanloom.schemas.product import Document, Stream, Table, attribute, column
 from scanloom.schemas.session import Matrix4
@@ -37,6 +37,13 @@ class CameraModel(_Entry):
     cy_px: float
     distortion: tuple[float, ...] = ()
     """radial-tangential: k1 k2 p1 p2 [k3 [k4 k5 k6]]; equidistant: k1 k2 k3 k4 (Kannala and Brandt 2006)."""
+
+    @model_validator(mode="after")
+    def _as_many_as_the_lens_has(self) -> Self:
+        if len(self.distortion) not in COEFFICIENTS[self.lens]:
+            wanted = " or ".join(str(n) for n in COEFFICIENTS[self.lens])
+            raise ValueError(f"a {self.lens} lens has {wanted} coefficients, not {len(self.distortion)}")
+        return self
 
 
 class Camera(_Entry):
