@@ -25,6 +25,7 @@ from scanloom.stages.clean.around import (
     SOLID,
     WENT,
     over_ground,
+    seen_ranges,
     sticks_out,
 )
 from scanloom.stages.clean.clusters import clusters
@@ -47,6 +48,7 @@ ROUNDED = 0.01
 """When more than this share of what stands has the very lowest intensity, that tells nothing."""
 LEAST_ODDS = (0.0, -0.3)
 """Log-odds of each round from which on a return is in the air."""
+STANDS = int(Standing.STANDS)
 HEARD_AGAIN = -6.0
 """Log-odds from which on a return is asked about in the next round."""
 
@@ -71,7 +73,7 @@ TAKEN = np.array(
 )
 """What a return is taken for at first, by Standing and PointClass."""
 _ALL = _by_class(1, 1, 1, 0, 0)
-ASKED = np.array([_ALL, _by_class(0, 1, 1, 0, 0), _ALL, _ALL], bool)
+ASKED = np.array([_ALL, _by_class(0, 1, 1, 0, 0), _ALL, _ALL], np.uint8)
 """Whether it may be in the air wherever it is: neither ground nor what denoise and the map agree on to stand."""
 AFTERWARDS = np.array([OTHER, SOLID, WENT, WENT], np.uint8)
 """What is neither ground nor in the air is taken for, by Standing."""
@@ -91,29 +93,34 @@ class Known:
     """Whether they lie in one or close to it."""
     cell: I4
     """In the image of directions, -1 outside."""
+    away_m: F4
+    """Their ranges."""
     image: I4
-    asked: B1
-    """Whether they may be in the air (`may_fly`)."""
+    taken: U1
+    """What they are taken for at first."""
+    asked: I8
+    """Those (m,) that may be in the air (`may_fly`)."""
     near: U1
     """(n, 2): how many of the 26 voxels around stand, and went; of those asked about."""
 
 
-def may_fly(scan: DeskewedScan, classes: U1, said: U1, cell: I4, image: I4) -> B1:
-    """Which returns (n,) are asked about, by class and Standing (n,) and by what is around them."""
-    asked = np.asarray(ASKED[said, classes])
-    air = TAKEN[said, classes] == AIR
-    asked |= sticks_out(scan.x_m, scan.y_m, scan.z_m, classes, cell, image)
-    return np.asarray(asked | over_ground(scan.x_m, scan.y_m, scan.z_m, classes, cell, image, air))
+def may_fly(scan: DeskewedScan, classes: U1, said: U1, taken: U1, cell: I4, away_m: F4, image: I4) -> I8:
+    """Returns (m,) that are asked about, by class and Standing (n,) and by what is around them."""
+    asked = by_standing(said, classes, ASKED).view(np.bool_)
+    asked |= sticks_out(away_m, classes, cell, image)
+    asked |= over_ground(scan.x_m, scan.y_m, scan.z_m, away_m, classes, taken, cell, image)
+    return np.flatnonzero(asked)
 
 
 def airborne(scan: DeskewedScan, known: Known, apart_m: float) -> B1:
     """Which returns (n,) of a scan are in the air; neighbours whose ranges differ by less than `apart_m` are one thing."""
     out = np.zeros(len(scan), np.bool_)
     loose = is_loose(known)
-    thing, strength = things(scan, known, loose, apart_m), strengths(scan, known)
-    taken, asked = TAKEN[known.said, known.classes], np.flatnonzero(known.asked)
+    thing, strength = things(known, loose, apart_m), strengths(scan, known)
+    taken, asked = known.taken.copy(), known.asked
+    ranges = seen_ranges(known.away_m, taken, known.image)
     for table, least in zip(weights.ROUNDS, LEAST_ODDS, strict=True):
-        odds = added(evidence(scan, known, thing, loose, strength, taken, asked), table)
+        odds = added(evidence(scan, known, ranges, thing, loose, strength, taken, asked), table)
         out[asked] = odds > least
         taken[asked] = taken_next(known, asked, odds > least)
         asked = asked[odds > HEARD_AGAIN]
@@ -128,19 +135,21 @@ def taken_next(known: Known, asked: I8, fly: B1) -> U1:
 
 def is_loose(known: Known) -> B1:
     """Returns (n,) that things are made of: those asked about that do not stand, without ground."""
-    stuck = (known.said == Standing.STANDS) | (known.classes == PointClass.GROUND)
-    return np.asarray(known.asked & ~stuck)
+    said, classes = known.said[known.asked], known.classes[known.asked]
+    out = np.zeros(len(known.said), np.bool_)
+    out[known.asked] = (said != Standing.STANDS) & (classes != PointClass.GROUND)
+    return out
 
 
-def things(scan: DeskewedScan, known: Known, loose: B1, apart_m: float) -> I4:
+def things(known: Known, loose: B1, apart_m: float) -> I4:
     """Number (n,) of the first return of what each hangs together with, among the loose."""
-    return np.asarray(clusters(scan.x_m, scan.y_m, scan.z_m, loose, known.cell, apart_m))
+    return np.asarray(clusters(known.away_m, loose, known.cell, apart_m))
 
 
 def strengths(scan: DeskewedScan, known: Known) -> U1:
     """Bin (n,) of the intensity of each return asked about, relative to the brighter ones of what stands."""
     out = np.full(len(scan), NO_STRENGTH, np.uint8)
-    standing = scan.intensity[known.said == Standing.STANDS][::SAMPLED]
+    standing = scan.intensity[_some_standing(known.said)]
     standing = standing[np.isfinite(standing)]
     if len(standing) < LEAST_BRIGHT or np.ptp(standing) == 0.0:
         return out
@@ -154,15 +163,37 @@ def strengths(scan: DeskewedScan, known: Known) -> U1:
 
 
 def evidence(
-    scan: DeskewedScan, known: Known, thing: I4, loose: B1, strength: U1, taken: U1, asked: I8
+    scan: DeskewedScan, known: Known, ranges: F4, thing: I4, loose: B1, strength: U1, taken: U1, asked: I8
 ) -> U1:
     """Bins (m, KINDS) of what is known of the returns asked about, the others being what they are taken for (n,)."""
     return np.asarray(
         signs(
-            scan.x_m, scan.y_m, scan.z_m, known.classes, known.said, known.box, known.beside, known.near, known.cell,
-            known.image, thing, strength, taken, loose, asked,
+            scan.x_m, scan.y_m, scan.z_m, known.away_m, known.classes, known.said, known.box, known.beside, known.near,
+            known.cell, known.image, ranges, thing, strength, taken, loose, asked,
         )
     )  # fmt: skip
+
+
+@kernel
+def by_standing(said: U1, classes: U1, table: U1) -> U1:
+    """Value (n,) of a table (Standing, PointClass) for each return."""
+    out = np.empty(len(said), np.uint8)
+    for n in range(len(said)):
+        out[n] = table[said[n], classes[n]]
+    return out
+
+
+@kernel
+def _some_standing(said: U1) -> I8:
+    """Every so-manieth return whose place stands."""
+    out, seen, kept = np.empty(len(said) // SAMPLED + 1, np.int64), 0, 0
+    for n in range(len(said)):
+        if said[n] == STANDS:
+            if seen % SAMPLED == 0:
+                out[kept] = n
+                kept += 1
+            seen += 1
+    return out[:kept].copy()
 
 
 @kernel

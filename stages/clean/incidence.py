@@ -10,16 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.stages.geometry.kernels import kernel
+from scanloom.stages.geometry.range_image import turn_of
 
 F4 = NDArray[np.float32]
 I4 = NDArray[np.int32]
 
-ROWS, COLUMNS = 256, 1024
+COLUMN_BITS = 10
+ROWS, COLUMNS = 256, 1 << COLUMN_BITS
 LOWEST_RAD, HIGHEST_RAD = np.radians(-56.0), np.radians(56.0)
 ROW_RAD = (HIGHEST_RAD - LOWEST_RAD) / ROWS
 BESIDE, ABOVE = 2, 5
 """Cells to each side, and upwards and downwards, in which the next return is looked for."""
 LEAST_SINE = 0.02
+ZERO, HALF, WHOLE, ENDLESS = (np.float32(c) for c in (0.0, 0.5, 1.0, np.inf))
+LOWEST_TURN, ROWS_PER_TURN = np.float32(LOWEST_RAD / (2.0 * np.pi)), np.float32(2.0 * np.pi / ROW_RAD)
+COLUMNS_PER_TURN, LAST_COLUMN = np.float32(COLUMNS), np.int32(COLUMNS - 1)
+ALL_ROWS, PER_ROW, NOWHERE = np.float32(ROWS), np.int32(COLUMNS), np.int32(-1)
 
 
 def new_image() -> I4:
@@ -28,26 +34,25 @@ def new_image() -> I4:
 
 
 @kernel
-def fill(x: F4, y: F4, z: F4, image: I4) -> I4:
-    """Put the nearest return of every direction into the image; returns the cell (n,) of each, -1 outside."""
+def fill(x: F4, y: F4, z: F4, image: I4) -> tuple[I4, F4]:
+    """Put the nearest return of every direction into the image; returns the cell (n,) of each, -1 outside, and its range."""
+    cell, away = np.empty(len(x), np.int32), np.empty(len(x), np.float32)
+    for n in range(len(x)):  # apart from the drawing, so that the compiler takes several points at once
+        level = x[n] * x[n] + y[n] * y[n]
+        r = np.sqrt(level + z[n] * z[n])
+        up = turn_of(np.sqrt(level), z[n])
+        row = ((up if up < HALF else up - WHOLE) - LOWEST_TURN) * ROWS_PER_TURN
+        column = min(np.int32(turn_of(x[n], y[n]) * COLUMNS_PER_TURN), LAST_COLUMN)
+        seen = (r > ZERO) & (r < ENDLESS) & (row >= ZERO) & (row < ALL_ROWS)
+        cell[n], away[n] = np.int32(row) * PER_ROW + column if seen else NOWHERE, r
     image[:] = -1
-    cell = np.full(len(x), -1, np.int32)
-    nearest = np.full(ROWS * COLUMNS, np.inf, np.float32)
     flat = image.reshape(-1)
     for n in range(len(x)):
-        px, py, pz = float(x[n]), float(y[n]), float(z[n])
-        r = np.sqrt(px * px + py * py + pz * pz)
-        if not r > 0.0:
-            continue
-        row = int(np.floor((np.arcsin(pz / r) - LOWEST_RAD) / ROW_RAD))
-        if not 0 <= row < ROWS:
-            continue
-        column = int((np.arctan2(py, px) + np.pi) * (COLUMNS / (2.0 * np.pi))) % COLUMNS
-        cell[n] = row * COLUMNS + column
-        if r < nearest[cell[n]]:
-            nearest[cell[n]] = r
-            flat[cell[n]] = n
-    return cell
+        if cell[n] >= 0:
+            before = flat[cell[n]]
+            if before < 0 or away[n] < away[before]:
+                flat[cell[n]] = n
+    return cell, away
 
 
 @kernel
@@ -57,7 +62,7 @@ def clear_ranges(x: F4, y: F4, z: F4, cell: I4, image: I4, clearance_m: float) -
     for n in range(len(x)):
         if cell[n] < 0:
             continue
-        row, column = cell[n] // COLUMNS, cell[n] % COLUMNS
+        row, column = cell[n] >> COLUMN_BITS, cell[n] & LAST_COLUMN
         sine = min(_beside(x, y, z, n, row, column, image), _above(x, y, z, n, row, column, image))
         px, py, pz = float(x[n]), float(y[n]), float(z[n])
         r = np.sqrt(px * px + py * py + pz * pz)
@@ -71,7 +76,7 @@ def _beside(x: F4, y: F4, z: F4, n: int, row: int, column: int, image: I4) -> fl
     best = -1.0
     for side in (-1, 1):
         for step in range(1, BESIDE + 1):
-            other = image[row, (column + side * step) % COLUMNS]
+            other = image[row, (column + side * step) & LAST_COLUMN]
             if other >= 0:
                 best = max(best, _sine(x, y, z, n, other))
                 break

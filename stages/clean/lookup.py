@@ -11,12 +11,13 @@ from scanloom.schemas.scans import DeskewedScan
 from scanloom.stages.clean.field import I4, I8, brick_key, brick_table, inner, row_of, voxel_at
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.voxels import EMPTY, Int
 
 B1 = NDArray[np.bool_]
 F4 = NDArray[np.float32]
 U1 = NDArray[np.uint8]
 
-STANDS = int(Standing.STANDS)
+UNKNOWN, STANDS = np.uint8(Standing.UNKNOWN), np.uint8(Standing.STANDS)
 AHEAD_M = 150.0
 """Tiles within this distance of a scan are opened; farther ones are let go."""
 
@@ -31,19 +32,20 @@ class Verdicts:
         self._held: frozenset[int] = frozenset()
         self._size_m = cleared[0].tile_size_m if len(cleared) else 0.0
         self._voxel_m = cleared[0].voxel_size_m if len(cleared) else 1.0
+        self._place = np.full(2, np.nan)
         self._index([])
 
-    def of(self, scan: DeskewedScan, asked: B1, T_world_lidar: F8) -> U1:
-        """Standing (n,) of the points of a scan that are asked, UNKNOWN of the others."""
+    def of(self, scan: DeskewedScan, classes: U1, asked: B1, T_world_lidar: F8) -> U1:
+        """Standing (n,) of the points of a scan whose class is `asked` (classes,), UNKNOWN of the others."""
         self._move_to(T_world_lidar[:2, 3])
         said: U1 = standing(
-            scan.x_m, scan.y_m, scan.z_m, asked, np.ascontiguousarray(T_world_lidar), 1.0 / self._voxel_m,
+            scan.x_m, scan.y_m, scan.z_m, classes, asked, np.ascontiguousarray(T_world_lidar), 1.0 / self._voxel_m,
             self._keys, self._rows, self._verdict,
         )  # fmt: skip
         return said
 
-    def around(self, scan: DeskewedScan, asked: B1, T_world_lidar: F8) -> U1:
-        """How many (n, 2) of the 26 voxels around the points that are asked stand, and moved or have changed."""
+    def around(self, scan: DeskewedScan, asked: I8, T_world_lidar: F8) -> U1:
+        """How many (n, 2) of the 26 voxels around the points `asked` (m,) stand, and moved or have changed; 0 of the others."""
         self._move_to(T_world_lidar[:2, 3])
         counted: U1 = standing_around(
             scan.x_m, scan.y_m, scan.z_m, asked, np.ascontiguousarray(T_world_lidar), 1.0 / self._voxel_m,
@@ -52,6 +54,9 @@ class Verdicts:
         return counted
 
     def _move_to(self, place: F8) -> None:
+        if np.array_equal(place, self._place):
+            return
+        self._place = place.copy()
         low = self._tiles * self._size_m
         off = np.maximum(np.maximum(low - place, place - low - self._size_m), 0.0)
         distance = np.hypot(off[:, 0], off[:, 1])
@@ -74,15 +79,19 @@ class Verdicts:
 
 @kernel
 def standing(
-    x: F4, y: F4, z: F4, asked: B1, T: F8, per_m: float, keys: I8, rows: I4, verdict: U1
+    x: F4, y: F4, z: F4, classes: U1, asked: B1, T: F8, per_m: float, keys: I8, rows: I4, verdict: U1
 ) -> U1:  # fmt: skip
-    """Verdict (n,) on the voxel of each asked point."""
+    """Verdict (n,) on the voxel of each point whose class is asked."""
     out = np.zeros(len(x), np.uint8)
+    last: Int = EMPTY
+    row: Int = -1
     for n in range(len(x)):
-        if not asked[n]:
+        if not asked[classes[n]]:
             continue
         i, j, k = voxel_at(float(x[n]), float(y[n]), float(z[n]), T, per_m)
-        row = row_of(keys, rows, brick_key(i, j, k))
+        key = brick_key(i, j, k)
+        if key != last:
+            row, last = row_of(keys, rows, key), key
         if row >= 0:
             out[n] = verdict[row, inner(i, j, k)]
     return out
@@ -90,25 +99,40 @@ def standing(
 
 @kernel
 def standing_around(
-    x: F4, y: F4, z: F4, asked: B1, T: F8, per_m: float, keys: I8, rows: I4, verdict: U1
+    x: F4, y: F4, z: F4, asked: I8, T: F8, per_m: float, keys: I8, rows: I4, verdict: U1
 ) -> U1:  # fmt: skip
-    """Voxels (n, 2) around that of each asked point that stand, and that moved or have changed."""
+    """Voxels (n, 2) around that of each point asked about that stand, and that moved or have changed."""
     out = np.zeros((len(x), 2), np.uint8)
-    for n in range(len(x)):
-        if not asked[n]:
-            continue
+    near = np.empty(8, np.int64)
+    for n in asked:
         i, j, k = voxel_at(float(x[n]), float(y[n]), float(z[n]), T, per_m)
-        own = brick_key(i, j, k)
-        own_row = row_of(keys, rows, own)
-        for q in range(27):
-            u, v, w = i + q // 9 - 1, j + q // 3 % 3 - 1, k + q % 3 - 1
-            key = brick_key(u, v, w)
-            row = own_row if key == own else row_of(keys, rows, key)
-            if row < 0 or q == 13:
-                continue
-            said = verdict[row, inner(u, v, w)]
-            if said == STANDS:
-                out[n, 0] += 1
-            elif said > STANDS:
-                out[n, 1] += 1
+        _bricks_around(i, j, k, keys, rows, near)
+        stands, went = 0, 0
+        for u in range(i - 1, i + 2):
+            for v in range(j - 1, j + 2):
+                for w in range(k - 1, k + 2):
+                    said = _verdict_at(u, v, w, i - 1, j - 1, k - 1, near, verdict)
+                    stands, went = stands + int(said == STANDS), went + int(said > STANDS)
+        own = _verdict_at(i, j, k, i - 1, j - 1, k - 1, near, verdict)
+        out[n, 0], out[n, 1] = stands - int(own == STANDS), went - int(own > STANDS)
     return out
+
+
+@kernel
+def _bricks_around(i: Int, j: Int, k: Int, keys: I8, rows: I4, near: I8) -> None:
+    """Rows (8,) of the bricks that a voxel and those around it lie in, by whether it is the farther along each axis."""
+    last: Int = EMPTY
+    row: Int = -1
+    for q in range(8):
+        key = brick_key(i + 1 if q & 4 else i - 1, j + 1 if q & 2 else j - 1, k + 1 if q & 1 else k - 1)
+        if key != last:
+            row, last = row_of(keys, rows, key), key
+        near[q] = row
+
+
+@kernel
+def _verdict_at(u: Int, v: Int, w: Int, i: Int, j: Int, k: Int, near: I8, verdict: U1) -> int:
+    """Of one of the voxels from (i, j, k) on, up to two on along each axis, given the rows of their bricks (8,)."""
+    farther = 4 * int(u >> 3 > i >> 3) + 2 * int(v >> 3 > j >> 3) + int(w >> 3 > k >> 3)
+    row = near[farther]
+    return verdict[row, inner(u, v, w)] if row >= 0 else UNKNOWN  # type: ignore[return-value]

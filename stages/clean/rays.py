@@ -113,7 +113,7 @@ def _mark(settings: Settings, field: VoxelField, image: np.ndarray, placed: list
         )
     spare = max(len(placed) - settings.walked_scans, 0)
     for x, y, z, _, _, T in placed[spare // 2 : len(placed) - (spare - spare // 2)]:
-        cell = incidence.fill(x, y, z, image)
+        cell, _ = incidence.fill(x, y, z, image)
         clear = incidence.clear_ranges(x, y, z, cell, image, settings.clearance_m)
         since = followed_since(cell, clear, settings.voxel_size_m)
         _until_done(field, walk, (x, y, z, since, clear, T, settings.reach_m, settings.voxel_size_m), len(x))

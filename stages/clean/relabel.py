@@ -23,25 +23,24 @@ from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
 from scanloom.schemas.trajectory import Poses
 from scanloom.stages.clean import incidence
-from scanloom.stages.clean.airborne import Known, airborne, may_fly
+from scanloom.stages.clean.airborne import TAKEN, Known, airborne, by_standing, may_fly
 from scanloom.stages.clean.clusters import clusters
 from scanloom.stages.clean.lookup import Verdicts
-from scanloom.stages.clean.moving import MovingBoxes, boxed, number_of_box
+from scanloom.stages.clean.moving import MovingBoxes, where_boxed
+from scanloom.stages.clean.things import judge_things, settle
 from scanloom.stages.geometry.se3 import F8
 
-VERSION = 3
+VERSION = 4
 
 U1 = NDArray[np.uint8]
 B1 = NDArray[np.bool_]
+F4 = NDArray[np.float32]
 I4 = NDArray[np.int32]
 I8 = NDArray[np.int64]
-STATIC, DYNAMIC, AIRBORNE = int(PointClass.STATIC), int(PointClass.DYNAMIC), int(PointClass.AIRBORNE)
+AIRBORNE = int(PointClass.AIRBORNE)
 JUDGED = (PointClass.UNLABELLED, PointClass.STATIC, PointClass.DYNAMIC)
-RESTORED = (PointClass.DYNAMIC, PointClass.OUTLIER)
-"""What denoise took for something else and the map knows to stand."""
-ASKED = (*JUDGED, PointClass.AIRBORNE, PointClass.OUTLIER)
-DECIDED = ((Standing.CHANGED, PointClass.CHANGED), (Standing.MOVED, PointClass.DYNAMIC))
-"""What a verdict makes of a point; the last word is the second's."""
+ASKED = np.isin(list(PointClass), (*JUDGED, PointClass.AIRBORNE, PointClass.OUTLIER))
+"""Classes whose places are looked up."""
 
 
 class Settings(BaseModel):
@@ -136,7 +135,7 @@ def _counting(
 
 
 def _counted(classes: U1) -> I8:
-    return np.bincount(classes, minlength=len(PointClass))[: len(PointClass)]
+    return np.array([np.count_nonzero(classes == int(each)) for each in PointClass], np.int64)
 
 
 def final(settings: Settings, scan: DeskewedScan, classes: U1, known: _Map) -> U1:
@@ -144,50 +143,30 @@ def final(settings: Settings, scan: DeskewedScan, classes: U1, known: _Map) -> U
     T_world_lidar = known.pose(scan)
     if T_world_lidar is None:
         return classes
-    said = known.verdicts.of(scan, np.isin(classes, ASKED), T_world_lidar)
-    cell = incidence.fill(scan.x_m, scan.y_m, scan.z_m, known.image)
+    said = known.verdicts.of(scan, classes, ASKED, T_world_lidar)
+    cell, away_m = incidence.fill(scan.x_m, scan.y_m, scan.z_m, known.image)
     boxes = known.moving.of(scan)
-    box = number_of_box(scan, boxes, settings.box_margin_m)
-    near, around = box >= 0, boxed(scan, boxes, settings.wide_box_margin_m)
+    box, around, above = where_boxed(
+        scan, boxes, settings.box_margin_m, settings.wide_box_margin_m, settings.foot_m
+    )
     if settings.particles:
-        asked = may_fly(scan, classes, said, cell, known.image)
+        taken = by_standing(said, classes, TAKEN)
+        asked = may_fly(scan, classes, said, taken, cell, away_m, known.image)
         beside = known.verdicts.around(scan, asked, T_world_lidar)
-        all_known = Known(classes, said, box, around, cell, known.image, asked, beside)
+        all_known = Known(classes, said, box, around, cell, away_m, known.image, taken, asked, beside)
         fly = airborne(scan, all_known, settings.apart_m)
     else:
-        fly = (classes == AIRBORNE) & (said != Standing.STANDS) & ~near
-    out = np.where(fly, AIRBORNE, _without_air(classes, said, near)).astype(np.uint8)
-    out[(out == PointClass.GROUND) & boxed(scan, boxes, settings.box_margin_m, settings.foot_m)] = DYNAMIC
-    judged = np.isin(out, JUDGED)
-    said[judged & (near | (around & (said != Standing.STANDS)))] = Standing.MOVED
-    said[out == DYNAMIC] = Standing.MOVED
-    _decide_things(settings, scan, cell, said, judged, out)
+        fly = (classes == AIRBORNE) & (said != Standing.STANDS) & (box < 0)
+    out, judged = settle(classes, said, fly, box, around, above)
+    _decide_things(settings, away_m, cell, said, judged, out)
     return out
 
 
-def _without_air(classes: U1, said: U1, near: B1) -> U1:
-    """Classes (n,), nothing being in the air: what stands is restored, strays in a moving box are its own."""
-    out = classes.copy()
-    out[(classes == AIRBORNE) | ((said == Standing.STANDS) & np.isin(classes, RESTORED))] = STATIC
-    out[near & (out == PointClass.OUTLIER)] = DYNAMIC
-    return out
-
-
-def _decide_things(settings: Settings, scan: DeskewedScan, cell: I4, said: U1, judged: B1, out: U1) -> None:
+def _decide_things(settings: Settings, away_m: F4, cell: I4, said: U1, judged: B1, out: U1) -> None:
     """Write what moved or has changed into the classes `out` (n,), whole things with what is told of most of them."""
     for usable, least in (
         (judged, settings.whole_share),
         (judged & (said != Standing.STANDS), settings.moved_share),
     ):
-        thing = clusters(scan.x_m, scan.y_m, scan.z_m, usable, cell, settings.apart_m)
-        for standing, class_ in DECIDED:
-            told = judged & (said == standing)
-            out[told | (usable & _of_such(thing, told, settings.least_points, least))] = class_
-
-
-def _of_such(thing: NDArray[np.int32], told: B1, least_points: int, least_share: float) -> B1:
-    """Points (n,) of things of which enough points are told."""
-    points = np.bincount(thing, minlength=len(thing))
-    share = np.bincount(thing, weights=told, minlength=len(thing)) / np.maximum(points, 1)
-    whole = (points >= least_points) & (share >= least_share)
-    return whole[thing]
+        thing = clusters(away_m, usable, cell, settings.apart_m)
+        judge_things(thing, judged, usable, said, settings.least_points, least, out)

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from scanloom.schemas.clean import Standing
 from scanloom.schemas.scans import PointClass
 from scanloom.stages.clean.around import AIR, BEYOND, GROUND, NOTHING, SOLID, WENT, look_around
-from scanloom.stages.clean.incidence import I4
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8
 
 B1 = NDArray[np.bool_]
 F4 = NDArray[np.float32]
+I4 = NDArray[np.int32]
 I8 = NDArray[np.int64]
 U1 = NDArray[np.uint8]
 
@@ -44,6 +44,7 @@ HEIGHT_EDGES_M = np.array([-0.1, 0.04, 0.1, 0.2, 0.4, 0.8])
 CLASSES, SIZES, RANGES, CLOUDY = 5, len(SIZE_EDGES) + 1, len(RANGE_EDGES_M) + 1, len(CLOUDY_EDGES) + 1
 IN_NO_BOX, BESIDE_A_BOX = len(BOX_EDGES) + 1, len(BOX_EDGES) + 2
 NO_GROUND = len(HEIGHT_EDGES_M) + 1
+NO_BOX = np.int32(-1)
 MANY = 5
 """Returns of a thing from which on it tells whether it went, and whether what is in the air hangs in clouds."""
 HALF = 3
@@ -52,16 +53,18 @@ HALF = 3
 
 @kernel
 def signs(
-    x: F4, y: F4, z: F4, classes: U1, said: U1, box: I4, beside: B1, near: U1, cell: I4, image: I4,
-    thing: I4, strength: U1, taken: U1, loose: B1, asked: I8,
+    x: F4, y: F4, z: F4, away: F4, classes: U1, said: U1, box: I4, beside: B1, near: U1, cell: I4, image: I4,
+    ranges: F4, thing: I4, strength: U1, taken: U1, loose: B1, asked: I8,
 ) -> U1:  # fmt: skip
     """Bins (m, KINDS) of the returns asked about, all (n,) being what they are taken for.
 
-    near (n, 2): voxels around that stand, that went. loose (n,): what things are counted of. strength (n,): bins.
+    away (n,): ranges, m; `ranges` those in the image (`seen_ranges`). near (n, 2): voxels around that stand, that went. loose (n,): what things are counted of.
+    strength (n,): bins.
     """
-    size, air, went = _of_things(said, taken, thing, loose)
+    members = np.flatnonzero(loose)
+    size, air, went = _of_things(said, taken, thing, members)
     inside, air_inside = _of_boxes(taken, box)
-    share, cloudy = _of_scan(taken, thing, size, loose)
+    share, cloudy = _of_scan(taken, thing, size, members)
     found = np.empty((len(asked), KINDS), np.uint8)
     around, ground_m = np.zeros(NOTHING + 1, np.int64), np.zeros(1)
     for m in range(len(asked)):
@@ -70,7 +73,7 @@ def signs(
         far = _bin_of(np.sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n]), RANGE_EDGES_M)
         in_box = BESIDE_A_BOX if beside[n] else IN_NO_BOX
         if box[n] >= 0:
-            in_box = _bin_of(air_inside[box[n]] / max(inside[box[n]], 1.0), BOX_EDGES)
+            in_box = _bin_of(air_inside[box[n]] / max(inside[box[n]], 1), BOX_EDGES)
         found[m, WHAT] = 3 * what + min(said[n], 2)
         found[m, BOX] = 2 * in_box + (what == 2)
         found[m, WEATHER] = CLOUDY * share + cloudy
@@ -80,19 +83,19 @@ def signs(
         found[m, NEAR_STANDS] = CLASSES * _bin_of(float(near[n, 0]), NEAR_EDGES) + what
         found[m, NEAR_WENT] = CLOUDY * _bin_of(float(near[n, 1]), NEAR_EDGES) + cloudy
         _write_thing(size[t], air[t], went[t], far, cloudy, found[m])
-        look_around(x, y, z, n, cell[n], image, taken, around, ground_m)
+        look_around(x, y, z, away, n, cell[n], image, ranges, taken, around, ground_m)
         _write_around(around, z[n] - ground_m[0] / max(around[GROUND], 1), far, what, beside[n], found[m])
     return found
 
 
 @kernel
-def _write_thing(size: float, air: float, went: float, far: int, cloudy: int, found: U1) -> None:
+def _write_thing(size: int, air: int, went: int, far: int, cloudy: int, found: U1) -> None:
     """Bins (KINDS,) of the thing that a return is part of."""
-    sized, flying = _bin_of(size, SIZE_EDGES), _bin_of(air / max(size, 1.0), SHARE_EDGES)
+    sized, flying = _bin_of(float(size), SIZE_EDGES), _bin_of(air / max(size, 1), SHARE_EDGES)
     found[THING] = SIZES * flying + sized
     found[FAR] = 3 * far + (flying > 0) + (flying > HALF)
     found[CLOUD] = 2 * (CLOUDY * sized + cloudy) + (flying > HALF)
-    found[THING_WENT] = 2 * _bin_of(went / max(size, 1.0), WENT_EDGES) + (size >= MANY)
+    found[THING_WENT] = 2 * _bin_of(went / max(size, 1), WENT_EDGES) + (size >= MANY)
 
 
 @kernel
@@ -130,38 +133,42 @@ def _what(class_: int) -> int:
 
 
 @kernel
-def _of_things(said: U1, taken: U1, thing: I4, loose: B1) -> tuple[F8, F8, F8]:
-    """Returns (n,) of each thing, by the number of its first; those in the air; those whose place went."""
-    size, air, went = np.zeros(len(thing)), np.zeros(len(thing)), np.zeros(len(thing))
-    for n in range(len(thing)):
-        if loose[n]:
-            size[thing[n]] += 1.0
-            air[thing[n]] += taken[n] == AIR
-            went[thing[n]] += said[n] >= MOVED
+def _of_things(said: U1, taken: U1, thing: I4, members: I8) -> tuple[I4, I4, I4]:
+    """Members (n,) of each thing, by the number of its first; those in the air; those whose place went."""
+    size, air, went = (
+        np.zeros(len(thing), np.int32),
+        np.zeros(len(thing), np.int32),
+        np.zeros(len(thing), np.int32),
+    )
+    for n in members:
+        size[thing[n]] += 1
+        air[thing[n]] += taken[n] == AIR
+        went[thing[n]] += said[n] >= MOVED
     return size, air, went
 
 
 @kernel
-def _of_boxes(taken: U1, box: I4) -> tuple[F8, F8]:
+def _of_boxes(taken: U1, box: I4) -> tuple[I4, I4]:
     """Returns of each moving box that are not ground; those in the air."""
-    boxes = np.int64(0)
+    last = NO_BOX
     for n in range(len(box)):
-        boxes = max(boxes, box[n] + 1)
-    inside, air = np.zeros(boxes), np.zeros(boxes)
-    for n in range(len(box)):
-        if box[n] >= 0 and taken[n] != NOTHING and taken[n] != GROUND:
-            inside[box[n]] += 1.0
-            air[box[n]] += taken[n] == AIR
+        last = max(last, box[n])
+    inside, air = np.zeros(last + 1, np.int32), np.zeros(last + 1, np.int32)
+    if last > NO_BOX:
+        for n in range(len(box)):
+            if box[n] >= 0 and taken[n] != NOTHING and taken[n] != GROUND:
+                inside[box[n]] += 1
+                air[box[n]] += taken[n] == AIR
     return inside, air
 
 
 @kernel
-def _of_scan(taken: U1, thing: I4, size: F8, loose: B1) -> tuple[int, int]:
+def _of_scan(taken: U1, thing: I4, size: I4, members: I8) -> tuple[int, int]:
     """Bins of the share of a scan that is in the air, and of the share of this that hangs together in clouds."""
     all_, air, hanging = 0, 0, 0
     for n in range(len(taken)):
         all_ += taken[n] != NOTHING
-        if taken[n] == AIR:
-            air += 1
-            hanging += loose[n] and size[thing[n]] >= MANY
+        air += taken[n] == AIR
+    for n in members:
+        hanging += taken[n] == AIR and size[thing[n]] >= MANY
     return _bin_of(air / max(all_, 1), SCAN_EDGES), _bin_of(hanging / max(air, 1), CLOUDY_EDGES)

@@ -18,6 +18,7 @@ from scanloom.stages.clean.airborne import (
     TAKEN,
     Known,
     airborne,
+    by_standing,
     evidence,
     is_loose,
     may_fly,
@@ -25,9 +26,19 @@ from scanloom.stages.clean.airborne import (
     taken_next,
     things,
 )
-from scanloom.stages.clean.around import AIR, GROUND, OTHER, SOLID, over_ground, sticks_out
+from scanloom.stages.clean.around import (
+    AIR,
+    GROUND,
+    NOTHING,
+    OTHER,
+    SOLID,
+    look_around,
+    over_ground,
+    seen_ranges,
+    sticks_out,
+)
 from scanloom.stages.clean.field import brick_key, brick_table
-from scanloom.stages.clean.lookup import standing_around
+from scanloom.stages.clean.lookup import standing, standing_around
 from scanloom.stages.clean.relabel import Settings
 from tests.stages.clean.worlds import Drive, car, cleared_of, drive_past, rays_of, relabelled, wall
 
@@ -158,10 +169,11 @@ def test_ground_and_what_both_agree_on_is_not_asked_about() -> None:
 def known_of(drive: Drive, said: np.ndarray) -> Known:
     scan, n, classes = drive.scans[0], len(drive.scans[0]), drive.labels[0].class_
     image = incidence.new_image()
-    cell = incidence.fill(scan.x_m, scan.y_m, scan.z_m, image)
-    asked = may_fly(scan, classes, said, cell, image)
+    cell, away_m = incidence.fill(scan.x_m, scan.y_m, scan.z_m, image)
+    taken = by_standing(said, classes, TAKEN)
+    asked = may_fly(scan, classes, said, taken, cell, away_m, image)
     none = np.full(n, -1, np.int32), np.zeros(n, bool)
-    return Known(classes, said, *none, cell, image, asked, np.zeros((n, 2), np.uint8))
+    return Known(classes, said, *none, cell, away_m, image, taken, asked, np.zeros((n, 2), np.uint8))
 
 
 def test_evidence_stays_within_its_tables() -> None:
@@ -170,10 +182,11 @@ def test_evidence_stays_within_its_tables() -> None:
     scan = drive.scans[0]
     known = known_of(drive, rng.integers(0, 4, len(scan)).astype(np.uint8))
     known = replace(known, near=rng.integers(0, 27, (len(scan), 2)).astype(np.uint8))
-    asked, loose = np.flatnonzero(known.asked), is_loose(known)
-    taken = TAKEN[known.said, known.classes]
-    thing, strength = things(scan, known, loose, 0.4), strengths(scan, known)
-    found = evidence(scan, known, thing, loose, strength, taken, asked)
+    asked, loose, taken = known.asked, is_loose(known), known.taken
+    thing, strength = things(known, loose, 0.4), strengths(scan, known)
+    ranges = seen_ranges(known.away_m, taken, known.image)
+    found = evidence(scan, known, ranges, thing, loose, strength, taken, asked)
+    assert np.array_equal(taken, TAKEN[known.said, known.classes])
     assert found.shape == (len(asked), signs.KINDS)
     assert found.max() < weights.BINS
     assert len(np.unique(found[:, signs.WHAT])) >= 5
@@ -204,9 +217,9 @@ def test_what_is_nearer_than_both_its_neighbours_sticks_out() -> None:
         r[5] -= off
         x, y = (r * np.cos(angle)).astype(np.float32), (r * np.sin(angle)).astype(np.float32)
         image = incidence.new_image()
-        cell = incidence.fill(x, y, np.zeros_like(x), image)
+        cell, away_m = incidence.fill(x, y, np.zeros_like(x), image)
         for class_ in (PointClass.GROUND, PointClass.STATIC, PointClass.EGO, PointClass.OUT_OF_RANGE):
-            found = sticks_out(x, y, np.zeros_like(x), np.full(11, class_, np.uint8), cell, image)
+            found = sticks_out(away_m, np.full(11, class_, np.uint8), cell, image)
             counted = class_ in (PointClass.GROUND, PointClass.STATIC)
             assert found.tolist() == [is_out and counted and n == 5 for n in range(11)]
 
@@ -220,11 +233,12 @@ def test_ground_is_asked_about_under_what_is_in_the_air_close_by() -> None:
     classes = np.full(5, PointClass.GROUND, np.uint8)
     classes[0], classes[4] = PointClass.AIRBORNE, PointClass.STATIC
     image = incidence.new_image()
-    cell = incidence.fill(x, y, z, image)
-    assert over_ground(x, y, z, classes, cell, image, classes == PointClass.AIRBORNE).tolist() == [
+    cell, away_m = incidence.fill(x, y, z, image)
+    taken = np.where(classes == PointClass.AIRBORNE, AIR, OTHER).astype(np.uint8)
+    assert over_ground(x, y, z, away_m, classes, taken, cell, image).tolist() == [
         False, True, False, False, False,
     ]  # fmt: skip
-    assert not over_ground(x, y, z, classes, cell, image, np.zeros(5, bool)).any()
+    assert not over_ground(x, y, z, away_m, classes, np.full(5, OTHER, np.uint8), cell, image).any()
 
 
 def test_standing_and_gone_voxels_around_are_counted_across_bricks_without_the_own() -> None:
@@ -237,7 +251,7 @@ def test_standing_and_gone_voxels_around_are_counted_across_bricks_without_the_o
     verdict[1, 0, 3, 3], verdict[1, 1, 3, 3] = Standing.STANDS, Standing.CHANGED
     keys, rows = brick_table(np.array([brick_key(0, 0, 0), brick_key(8, 0, 0)], np.int64), 2)
     x, y, z = (np.array([each, each], np.float32) for each in (1.7, 0.7, 0.7))
-    asked = np.array([True, False])
+    asked = np.array([0])
     said = standing_around(x, y, z, asked, np.eye(4), 5.0, keys, rows, verdict.reshape(2, 512))
     assert said.tolist() == [[1, 2], [0, 0]]
 
@@ -260,3 +274,56 @@ def test_an_intensity_that_is_rounded_off_tells_nothing() -> None:
     rounded = scan.intensity.copy()
     rounded[dust], rounded[np.flatnonzero(~dust)[::16]] = 0.0, 0.0
     assert (strengths(replace(scan, intensity=rounded), known)[rows] == NO_STRENGTH).all()
+
+
+def test_voxels_around_are_those_of_each_by_itself() -> None:
+    rng = np.random.default_rng(4)
+    corners = np.array([[i, j, k] for i in range(-16, 16, 8) for j in range(-16, 16, 8) for k in (-8, 0)])
+    bricks = np.array([brick_key(*corner) for corner in corners], np.int64)[
+        rng.permutation(len(corners))[:24]
+    ]
+    keys, rows = brick_table(bricks, len(bricks))
+    verdict = rng.integers(0, 4, (len(bricks), 512)).astype(np.uint8)
+    at = rng.integers(-17, 17, (3, 500))
+    x, y, z = ((each + 0.5).astype(np.float32) for each in at)
+    table = keys, rows, verdict
+    found = standing_around(x, y, z, np.arange(500), np.eye(4), 1.0, *table)
+    expected = np.zeros((500, 2), int)
+    for step in np.ndindex(3, 3, 3):
+        u, v, w = ((each + s - 1).astype(np.float32) for each, s in zip((x, y, z), step))
+        said = standing(u, v, w, np.zeros(500, np.uint8), np.ones(1, bool), np.eye(4), 1.0, *table)
+        if step != (1, 1, 1):
+            expected += np.column_stack((said == Standing.STANDS, said > Standing.STANDS))
+    assert np.array_equal(found, expected)
+    assert expected.max() > 8
+
+
+def test_what_lies_around_is_counted_as_one_by_one() -> None:
+    rng = np.random.default_rng(6)
+    azimuth, elevation = rng.uniform(-np.pi, np.pi, 6000), rng.uniform(-0.2, 0.1, 6000)
+    r = rng.choice([8.0, 8.3, 9.5, 20.0], 6000) + rng.uniform(-0.2, 0.2, 6000)
+    level = r * np.cos(elevation)
+    x, y, z = (
+        each.astype(np.float32)
+        for each in (level * np.cos(azimuth), level * np.sin(azimuth), r * np.sin(elevation))
+    )
+    image = incidence.new_image()
+    cell, away_m = incidence.fill(x, y, z, image)
+    taken = rng.integers(0, 6, 6000).astype(np.uint8)
+    ranges = seen_ranges(away_m, taken, image)
+    points = np.column_stack((x, y, z)).astype(float)
+    row, column = np.divmod(cell, incidence.COLUMNS)
+    around, ground_m, beyond = np.zeros(6, np.int64), np.zeros(1), 0
+    for n in range(200):
+        look_around(x, y, z, away_m, n, cell[n], image, ranges, taken, around, ground_m)
+        aside = (column - column[n] + 512) % incidence.COLUMNS - 512
+        there = (abs(row - row[n]) <= 3) & (abs(aside) <= 4) & (image.ravel()[cell] == np.arange(6000))
+        there &= (taken != NOTHING) & (np.arange(6000) != n)
+        distance = np.linalg.norm(points - points[n], axis=1)
+        near = there & (distance < 0.6 + 0.03 * away_m[n])
+        expected = np.bincount(taken[near], minlength=6)
+        expected[NOTHING] = (there & ~near & (away_m > away_m[n])).sum()
+        assert np.array_equal(around, expected)
+        assert ground_m[0] == pytest.approx(z[near & (taken == GROUND)].sum(), abs=1e-5)
+        beyond += expected[NOTHING]
+    assert beyond > 100

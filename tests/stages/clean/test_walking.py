@@ -19,7 +19,7 @@ from scanloom.stages.clean.field import (
     inner,
     row_of,
 )
-from scanloom.stages.clean.incidence import clear_ranges, fill, new_image
+from scanloom.stages.clean.incidence import COLUMNS, LOWEST_RAD, ROW_RAD, ROWS, clear_ranges, fill, new_image
 from scanloom.stages.clean.leading import CELL_RAD, WIDTH_SHARE, followed_since
 from scanloom.stages.clean.tiles import brick_indices, bricks_by_tile
 from scanloom.stages.clean.walking import NEAREST_M, mark_hits, walk
@@ -173,7 +173,7 @@ def test_rays_that_lie_close_together_are_followed_where_they_part() -> None:
     )
     reach = np.where(rng.random(len(way)) < 0.2, rng.uniform(3.0, 12.0, len(way)), 40.0)
     points, image = reach[:, None] * way, new_image()
-    since = followed_since(fill(*columns(points), image), reach.astype(np.float32), VOXEL_M)
+    since = followed_since(fill(*columns(points), image)[0], reach.astype(np.float32), VOXEL_M)
     assert (since == 0.0).sum() < 0.02 * len(way)
     assert since.max() == pytest.approx(WIDTH_SHARE * VOXEL_M / CELL_RAD)
     seen = []
@@ -206,19 +206,19 @@ def test_grazing_rays_end_early_and_steep_ones_late() -> None:
     x = np.linspace(5.0, 40.0, 400)
     ground = np.column_stack((x, np.zeros_like(x), np.full_like(x, -1.8)))
     image = new_image()
-    cell = fill(*columns(ground), image)
+    cell, _ = fill(*columns(ground), image)
     clear = clear_ranges(*columns(ground), cell, image, 0.3)
     r = np.linalg.norm(ground, axis=1)
     kept = np.array(sorted(set(image[image >= 0].tolist())))[2:-2]
     expected = 0.3 * r[kept] / 1.8  # clearance over the sine of the angle to level ground
     assert (np.abs((r - clear)[kept] - expected) < 0.25 * expected + 0.05).mean() > 0.95
     alone = np.array([[10.0, 0.0, 0.0]])
-    assert clear_ranges(*columns(alone), fill(*columns(alone), image), image, 0.3)[0] == pytest.approx(9.7)
+    assert clear_ranges(*columns(alone), fill(*columns(alone), image)[0], image, 0.3)[0] == pytest.approx(9.7)
 
 
 def test_points_outside_the_image_say_nothing() -> None:
     up, image = np.array([[0.0, 0.0, 9.0], [np.nan, 0, 0], [0.0, 0, 0]]), new_image()
-    cell = fill(*columns(up), image)
+    cell, _ = fill(*columns(up), image)
     assert cell.tolist() == [-1, -1, -1]
     assert clear_ranges(*columns(up), cell, image, 0.3).tolist() == [0.0, 0.0, 0.0]
 
@@ -239,3 +239,28 @@ def test_every_brick_goes_to_the_tiles_it_reaches_into() -> None:
         }  # fmt: skip
         assert {name for name, rows in found.items() if n in rows} == wanted
     assert all((np.diff(bricks[rows]) > 0).all() for rows in found.values())
+
+
+def test_cells_are_those_of_exact_angles_but_at_borders() -> None:
+    rng = np.random.default_rng(9)
+    way = rng.normal(size=(20000, 3))
+    way[:3] = [[1.0, 0.0, 0.0], [-1.0, -1e-9, 0.0], [0.0, -1.0, 0.0]]
+    points = (rng.uniform(0.5, 90.0, 20000) / np.linalg.norm(way, axis=1))[:, None] * way
+    image = new_image()
+    cell, away_m = fill(*columns(points), image)
+    x, y, z = points.T
+    row = np.floor((np.arcsin(z / np.linalg.norm(points, axis=1)) - LOWEST_RAD) / ROW_RAD).astype(int)
+    column = np.floor(np.arctan2(y, x) % (2 * np.pi) * (COLUMNS / (2 * np.pi))).astype(int) % COLUMNS
+    inside = (row >= 0) & (row < ROWS)
+    same = np.where(inside, row * COLUMNS + column, -1) == cell
+    assert 0.98 < same.mean() < 1.0
+    seen = inside & (cell >= 0)
+    aside = (cell % COLUMNS - column + COLUMNS // 2) % COLUMNS - COLUMNS // 2
+    assert abs(cell // COLUMNS - row)[seen].max() <= 1
+    assert abs(aside[seen]).max() <= 1
+    assert away_m == pytest.approx(np.linalg.norm(points, axis=1), rel=1e-6)
+    first = image[image >= 0]
+    assert (np.diff(cell[first]) > 0).all()
+    nearest = np.full(ROWS * COLUMNS, np.inf, np.float32)
+    np.minimum.at(nearest, cell[cell >= 0], away_m[cell >= 0])
+    assert np.array_equal(away_m[first], nearest[cell[first]])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scanloom.stages.geometry.boxes import inside_boxes
+from scanloom.stages.geometry.boxes import inside_boxes, near_boxes
 from scanloom.stages.geometry.se3 import pose, so3_exp
 
 BOX = np.array([[1.0, 0, 0, 10.0, 0, 1.0, 0, 5.0, 0, 0, 1.0, -2.0, 4.0, 2.0, 1.5]])
@@ -49,3 +49,27 @@ def test_the_first_of_several_boxes_and_none() -> None:
     assert number(np.nan, 5.0, -1.0) == -1
     empty = np.empty(0, np.float32)
     assert len(inside_boxes(empty, empty, empty, BOX, 0.3)) == 0
+
+
+def test_many_boxes_are_as_each_by_itself() -> None:
+    rng = np.random.default_rng(2)
+    boxes = np.array(
+        [
+            [*pose(so3_exp(rng.normal(size=3) * [0.02, 0.02, 2.0]), rng.uniform(-20, 20, 3) * [1, 1, 0.1])[:3].ravel(), *size]
+            for size in rng.uniform(0.5, 6.0, (12, 3))
+        ]
+    )  # fmt: skip
+    x, y, z = (rng.uniform(-25, 25, 9000) * scale for scale in (1.0, 1.0, 0.1))
+    points = [each.astype(np.float32) for each in (x, y, z)]
+    expected = np.full(9000, -1)
+    for b in range(11, -1, -1):
+        T = boxes[b, :12].reshape(3, 4)
+        u, v, w = T[:, :3].T @ (np.array(points, float) - T[:, 3:])
+        length, width, height = boxes[b, 12:]
+        inside = (abs(u) <= length / 2 + 0.3) & (abs(v) <= width / 2 + 0.3) & (w >= 0.0) & (w <= height + 0.3)
+        expected[inside] = b
+    found = inside_boxes(*points, boxes, 0.3)
+    assert np.array_equal(found, expected)
+    assert (found >= 0).sum() > 100
+    assert (near_boxes(*points, boxes, 0.3) >= (found >= 0)).all()
+    assert near_boxes(*points, boxes, 0.3).mean() < 0.9
