@@ -1,0 +1,242 @@
+"""Boards in a cloud: flat pieces whose edges have the board's size and whose reflectance has its squares."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scanloom.stages.calibrate.board import Board
+from scanloom.stages.calibrate.cloud.background import foreground_of
+from scanloom.stages.calibrate.cloud.edges import Edges, edges_of
+from scanloom.stages.calibrate.cloud.found import CloudBoard, Refused, Search
+from scanloom.stages.calibrate.cloud.outline import Rectangle, fits, measured, plane_axes, seen_sides
+from scanloom.stages.calibrate.cloud.patches import Patch, patches
+from scanloom.stages.calibrate.cloud.pose import (
+    PoseFit,
+    Seen,
+    contrast_of,
+    fitted,
+    outside,
+    seen_of,
+    with_squares,
+)
+from scanloom.stages.calibrate.cloud.settings import CloudSettings
+from scanloom.stages.calibrate.cloud.sweep import I8, Sweep, sweep_of
+from scanloom.stages.geometry.se3 import F8, hat, pose, transform
+
+_LEAST_CONTRAST = 0.35
+"""Correlation of the reflectance with the print from which squares count as seen."""
+_LEAST_OVERLAP = 0.75
+"""Rays that are on both piece and board, of those on either."""
+_SHIFTS = np.linspace(-1.0, 1.0, 9)
+"""Squares by which starts are shifted where the edges leave the place open."""
+
+
+def find_boards(
+    points: F8,
+    intensity: F8,
+    ring: I8 | None,
+    board: Board,
+    background: F8 | None = None,
+    settings: CloudSettings | None = None,
+) -> list[CloudBoard]:
+    """Boards in a cloud, the best first; see `search_boards`."""
+    return list(search_boards(points, intensity, ring, board, background, settings).boards)
+
+
+def search_boards(
+    points: F8,
+    intensity: F8,
+    ring: I8 | None,
+    board: Board,
+    background: F8 | None = None,
+    settings: CloudSettings | None = None,
+) -> Search:
+    """Boards in a cloud (n, 3), m, with reflectance (n,) of any scale and the beam (n,) of each point if it is known.
+
+    `background` (k, 3) are points of the scene without the board (`static_points`). The cloud is one scan, or several
+    of a sensor that stands still, about the sensor's origin.
+    """
+    chosen = settings or CloudSettings()
+    foreground = (
+        np.ones(len(points), np.bool_)
+        if background is None
+        else foreground_of(points, background, chosen.static_m)
+    )
+    sweep = sweep_of(
+        np.asarray(points, np.float64), np.asarray(intensity), ring, foreground, chosen.min_range_m
+    )
+    found: list[CloudBoard] = []
+    refused: list[Refused] = []
+    if len(sweep.range_m):
+        for patch in patches(sweep, board, chosen):
+            result = _judged(sweep, patch, board, chosen)
+            if isinstance(result, Refused):
+                refused.append(result)
+            else:
+                found.append(result)
+    found = _distinct(found, board)
+    refused.sort(key=lambda piece: -piece.points)
+    return Search(tuple(found), tuple(refused))
+
+
+def _judged(sweep: Sweep, patch: Patch, board: Board, settings: CloudSettings) -> CloudBoard | Refused:
+    """The board a piece is, or why it is none."""
+    edges = edges_of(sweep, patch)
+    rectangle = measured(patch, edges)
+    if rectangle is None:
+        return _refused(sweep, patch, "too few of its edges can be seen")
+    ways = fits(rectangle, board, settings.extent_share)
+    if not any(ways):
+        size, wanted = (_size(value) for value in (rectangle.size, board.board_m))
+        return _refused(sweep, patch, f"measures {size}, the board {wanted}")
+    seen = seen_of(sweep, patch, edges, board, settings)
+    starts = [_start(patch, rectangle, board, turned) for turned, fit in enumerate(ways) if fit]
+    fit = _best(seen, starts, settings)
+    overlap = _overlap(sweep, patch, fit)
+    if overlap < _LEAST_OVERLAP:
+        return _refused(
+            sweep, patch, f"only {overlap:.0%} of it and of the board that fits best are the same rays"
+        )
+    if settings.reflectance == "require" and not fit.seen.squares:
+        return _refused(sweep, patch, f"no squares in its reflectance (correlation {fit.contrast:.2f})")
+    return _cloud_board(sweep, patch, rectangle, fit, overlap)
+
+
+def _size(pair: object) -> str:
+    long, short = sorted(np.asarray(pair, float), reverse=True)
+    return f"{long:.2f} x {short:.2f} m"
+
+
+def _refused(sweep: Sweep, patch: Patch, reason: str) -> Refused:
+    points = sweep.points[patch.rays]
+    return Refused(points.mean(axis=0), len(points), reason)
+
+
+def _start(patch: Patch, rectangle: Rectangle, board: Board, turned: int) -> F8:
+    """Pose of a board on the rectangle; `turned`: its first dimension is the rectangle's second."""
+    axes = plane_axes(patch)
+    angle = rectangle.angle + turned * np.pi / 2
+    c, s = np.cos(angle), np.sin(angle)
+    R = axes @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    centre = axes[:, :2] @ rectangle.centre - patch.distance_m * patch.normal
+    return pose(R, centre - R[:, :2] @ np.asarray(board.offset_m))
+
+
+def _best(seen: Seen, starts: list[F8], settings: CloudSettings) -> PoseFit:
+    """The best of the fits from all starts: by edges first, then with the squares where they can be seen."""
+    plain = min((fitted(seen, T) for T in starts), key=lambda fit: fit.cost)
+    if settings.reflectance == "ignore" or np.ptp(seen.intensity) <= 0:
+        return plain
+    options = []
+    for T in starts:
+        by_edges = fitted(seen, T)
+        for first_dark in (True, False):
+            squares = with_squares(seen, first_dark)
+            shift = _shifted(squares, by_edges)
+            options.append((contrast_of(squares, shift), squares, shift))
+    contrast, squares, T = max(options, key=lambda option: option[0])
+    if contrast < _LEAST_CONTRAST:
+        return plain
+    return fitted(squares, T)
+
+
+def _shifted(seen: Seen, fit: PoseFit) -> F8:
+    """The start moved within the plane to where the squares agree best, as far as the edges allow."""
+    T = fit.T_lidar_board
+    best, best_score = T, contrast_of(seen, T)
+    sigma = np.sqrt(np.diag(fit.covariance)[3:5])
+    steps = [
+        _SHIFTS[np.abs(_SHIFTS) * seen.board.square_m < max(3 * s, 0.3 * seen.board.square_m)] for s in sigma
+    ]
+    for x in steps[0]:
+        for y in steps[1]:
+            moved = T.copy()
+            moved[:3, 3] += T[:3, :2] @ (np.array([x, y]) * seen.board.square_m)
+            score = contrast_of(seen, moved)
+            if score > best_score:
+                best, best_score = moved, score
+    return best
+
+
+def _overlap(sweep: Sweep, patch: Patch, fit: PoseFit) -> float:
+    """Rays both on the piece and on the board, over those on either; those near the outline and hidden ones apart."""
+    directions = sweep.direction[patch.window]
+    ahead = directions @ fit.T_lidar_board[:3, 2] < -0.02
+    off = np.where(ahead, outside(fit.seen, fit.T_lidar_board, directions), np.inf)
+    slope = np.minimum(directions @ patch.normal, -1e-3)
+    hidden = sweep.range_m[patch.window] < -patch.distance_m / slope - 2 * patch.tolerance_m
+    margin = 0.02 + fit.seen.width_m
+    within, beyond = (off < -margin) & ~hidden, off > margin
+    both = (within & patch.inside).sum()
+    either = within.sum() + (beyond & patch.inside).sum()
+    return float(both / max(either, 1))
+
+
+def _cloud_board(
+    sweep: Sweep, patch: Patch, rectangle: Rectangle, fit: PoseFit, overlap: float
+) -> CloudBoard:
+    T, seen = fit.T_lidar_board, fit.seen
+    board = seen.board
+    edge = _edge_columns(seen.edges, seen, T)
+    corners = board.corners_m()
+    slopes = T[:3, :3] @ np.concatenate(
+        (-hat(corners), np.broadcast_to(np.eye(3), (len(corners), 3, 3))), axis=2
+    )
+    contrast = fit.contrast if seen.squares else 0.0
+    return CloudBoard(
+        points_m=sweep.points[patch.rays],
+        source=sweep.source[patch.rays],
+        edge_points_m=edge[0],
+        edge_directions=edge[1],
+        edge_left=seen.edges.left[~seen.edges.across],
+        edge_line=edge[2],
+        edge_sigma_m=edge[3],
+        T_lidar_board=T,
+        covariance=fit.covariance,
+        extent_m=_extent(rectangle, board, T, patch),
+        rmse_m=fit.rmse_m,
+        beam_sigma_m=0.0,
+        darker_m=fit.darker_m,
+        flare_m=fit.flare_m,
+        corners_m=transform(T, corners),
+        corner_covariance=slopes @ fit.covariance @ np.swapaxes(slopes, 1, 2),
+        first_dark=seen.first_dark if seen.squares else None,
+        contrast=contrast,
+        quality=overlap * (0.5 + 0.5 * max(contrast, 0.0)),
+    )
+
+
+def _edge_columns(edges: Edges, seen: Seen, T: F8) -> tuple[F8, F8, I8, F8]:
+    along = ~edges.across
+    middle = edges.on[along] + edges.off[along]
+    middle /= np.linalg.norm(middle, axis=1)[:, None]
+    n = T[:3, 2]
+    points = middle * ((n @ T[:3, 3]) / (middle @ n))[:, None]
+    flat = (points - T[:3, 3]) @ T[:3, :2] - np.asarray(seen.board.offset_m)
+    half = np.asarray(seen.board.board_m) / 2
+    # sides in the order of the outline: low y, high x, high y, low x
+    distance = np.column_stack(
+        (-flat[:, 1] - half[1], flat[:, 0] - half[0], flat[:, 1] - half[1], -flat[:, 0] - half[0])
+    )
+    on, off = (outside(seen, T, d[along]) for d in (edges.on, edges.off))
+    return points, middle, np.argmax(distance, axis=1), np.sqrt((off - on) ** 2 / 12 + 0.003**2)
+
+
+def _extent(rectangle: Rectangle, board: Board, T: F8, patch: Patch) -> tuple[float, float]:
+    axes = plane_axes(patch)
+    first = axes[:, :2] @ np.array([np.cos(rectangle.angle), np.sin(rectangle.angle)])
+    size = np.where(seen_sides(rectangle, board), rectangle.size, np.nan)
+    along = abs(first @ T[:3, 0]) > abs(first @ T[:3, 1])
+    return (float(size[0]), float(size[1])) if along else (float(size[1]), float(size[0]))
+
+
+def _distinct(found: list[CloudBoard], board: Board) -> list[CloudBoard]:
+    """The best of those in the same place, in the order of quality."""
+    out: list[CloudBoard] = []
+    for one in sorted(found, key=lambda b: -b.quality):
+        if all(
+            np.linalg.norm(one.T_lidar_board[:3, 3] - b.T_lidar_board[:3, 3]) > min(board.board_m) / 2
+            for b in out
+        ):
+            out.append(one)
+    return out
