@@ -1,4 +1,4 @@
-"""Residuals of the calibration graph with their derivatives, many rows at once, in units of their noise.
+"""Residuals of the calibration graph with their derivatives, many rows at once.
 
 Poses move on the right, T Exp(xi), xi = (rotation, translation), as everywhere.
 """
@@ -8,10 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from scanloom.stages.calibrate.rays import Bearings
-from scanloom.stages.geometry.se3 import F8, hat, transform
-
-_GRAZING = 0.05
-"""Least cosine between a ray and a board's normal that a residual divides by."""
+from scanloom.stages.geometry.se3 import F8, hat, so3_log, transform
 
 
 def corner_rows(T_lidar_camera: F8, T_lidar_board: F8, corners: F8, bearings: Bearings) -> tuple[F8, F8, F8]:
@@ -26,43 +23,28 @@ def corner_rows(T_lidar_camera: F8, T_lidar_board: F8, corners: F8, bearings: Be
     return error, by_camera, by_board
 
 
-def plane_rows(T_lidar_board: F8, points: F8) -> tuple[F8, F8]:
-    """How much farther along their own rays the board is than the points (n, 3) say: (n,), m, and by board (n, 6)."""
-    R, t = T_lidar_board[:3, :3], T_lidar_board[:3, 3]
-    directions = points / np.linalg.norm(points, axis=1)[:, None]
-    u = directions @ R
-    slant = _off_grazing(u[:, 2])
-    s = (t - points) @ R
-    gap = s[:, 2] / slant
-    by_turn = (np.cross(s, (0.0, 0.0, 1.0)) - gap[:, None] * np.cross(u, (0.0, 0.0, 1.0))) / slant[:, None]
-    by_shift = np.zeros((len(points), 3))
-    by_shift[:, 2] = 1.0 / slant
-    return gap, np.concatenate((by_turn, by_shift), axis=1)
+def cloud_rows(T_lidar_board: F8, T_cloud: F8, far_m: float) -> tuple[F8, F8, F8]:
+    """From the board by the cloud to the true one, as the LiDAR would see it: (6,) turn and shift in its frame.
 
-
-def line_rows(T_lidar_board: F8, points: F8, normals: F8, offsets: F8) -> tuple[F8, F8]:
-    """Distance (n,), m, on the board of rays through points (n, 3) from lines of its plane, and by board (n, 6).
-
-    A line is all x with normal . x = offset; normals (n, 2) are unit vectors in the board's frame.
+    The LiDAR reads every range too long by `far_m`; derivatives (6, 6) by the board and (6, 1) by that.
     """
-    R, t = T_lidar_board[:3, :3], T_lidar_board[:3, 3]
-    u = points / np.linalg.norm(points, axis=1)[:, None] @ R
-    slant = _off_grazing(u[:, 2])
-    s = t @ R
-    reach = s[2] / slant
-    x = reach[:, None] * u - s
-    distance = (normals * x[:, :2]).sum(axis=1) - offsets
-    # In the board's own axes u turns by hat(u) w and s by hat(s) w + v; x = (s_z / u_z) u - s
-    turn_u, turn_s = hat(u), hat(s)
-    by_reach = (turn_s[2] - reach[:, None] * turn_u[:, 2]) / slant[:, None]
-    by_turn = u[:, :, None] * by_reach[:, None, :] + reach[:, None, None] * turn_u - turn_s
-    by_shift = u[:, :, None] * (np.array([0.0, 0.0, 1.0]) / slant[:, None])[:, None, :] - np.eye(3)
-    J = np.concatenate((by_turn, by_shift), axis=2)
-    return distance, np.einsum("ni,nij->nj", normals, J[:, :2])
+    Rt = T_cloud[:3, :3].T
+    away = T_cloud[:3, 3] / np.linalg.norm(T_cloud[:3, 3])
+    turn = so3_log(Rt @ T_lidar_board[:3, :3])
+    shift = Rt @ (T_lidar_board[:3, 3] + far_m * away - T_cloud[:3, 3])
+    by_board = np.zeros((6, 6))
+    by_board[:3, :3] = _right_jacobian_inverse(turn)
+    by_board[3:, 3:] = Rt @ T_lidar_board[:3, :3]
+    by_far = np.concatenate((np.zeros(3), Rt @ away))[:, None]
+    return np.concatenate((turn, shift)), by_board, by_far
 
 
-def _off_grazing(slant: F8) -> F8:
-    return np.where(np.abs(slant) < _GRAZING, np.copysign(_GRAZING, slant), slant)
+def _right_jacobian_inverse(w: F8) -> F8:
+    """d so3_log(R exp(v)) / dv at v = 0 (Sola et al. 2018, eq. 144)."""
+    angle = float(np.linalg.norm(w))
+    K = hat(w)
+    bend = 1.0 / 12.0 if angle < 1e-4 else 1.0 / angle**2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))
+    return np.asarray(np.eye(3) + 0.5 * K + bend * K @ K)
 
 
 def softened(error: F8, limit: float) -> tuple[F8, F8]:
@@ -74,7 +56,6 @@ def softened(error: F8, limit: float) -> tuple[F8, F8]:
     size = np.linalg.norm(error, axis=1)
     far = size > limit
     root = np.sqrt(np.where(far, 2 * limit * size - limit**2, 1.0))
-    safe = np.where(far, size, 1.0)
-    by_error = np.where(far, root / safe, 1.0)
+    by_error = np.where(far, root / np.where(far, size, 1.0), 1.0)
     by_slope = np.where(far, limit / root, 1.0)
     return by_error[:, None], by_slope[:, None]

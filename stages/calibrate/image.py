@@ -75,7 +75,7 @@ def find_corners(image: U1, board: Board, model: CameraModel) -> ImageBoard | No
     fit = board_pose(bearings, board.corners_m()[index])
     if fit is None:
         return None
-    return ImageBoard(index, pixels, 1 if board.charuco else board.ambiguity, fit.rms_px, fit.T_camera_board)
+    return ImageBoard(index, pixels, board.ambiguity, fit.rms_px, fit.T_camera_board)
 
 
 def grey(data: bytes) -> U1 | None:
