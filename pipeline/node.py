@@ -18,6 +18,7 @@ AXES: dict[str, tuple[str, ...]] = {
     "chunk": ("session", "chunk"),
     "window": ("session", "window"),
     "submap": ("session", "submap"),
+    "footage": ("session", "footage"),
     "tile": ("tile",),
     "pair": ("pair",),
 }

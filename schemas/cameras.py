@@ -57,8 +57,22 @@ class Camera(_Entry):
     """Where the numbers come from: `camera info`, `calibration`, `kitti calibration`, `tf`, ..."""
     clock_offset_s: float = 0.0
     """How much later its stamps are than the LiDAR's clock; to be subtracted."""
-    readout_s: float = Field(0.0, ge=0.0)
+    readout_s: float = Field(default=0.0, ge=0.0)
     """From the first row to the last of a rolling shutter, 0 for a global one; an image's stamp is its middle."""
+
+
+class Footage(_Entry):
+    """What of a camera's images is used."""
+
+    camera: str
+    topic: str
+    images: int
+    """Images in the log."""
+    kept: int
+    """Images that go on: thinned, and whole."""
+    damaged: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
 
 
 class Cameras(Document):
@@ -67,6 +81,7 @@ class Cameras(Document):
     NAME: ClassVar[str] = "cameras"
 
     cameras: tuple[Camera, ...] = ()
+    footage: tuple[Footage, ...] = ()
     remarks: tuple[str, ...] = ()
     """What was found odd, in sentences."""
 
@@ -76,6 +91,7 @@ class Image(Table):
     """One image as the log holds it, still encoded; raw ones are packed without loss."""
 
     NAME: ClassVar[str] = "image"
+    PACKED: ClassVar[bool] = True
 
     data: NDArray[np.uint8] = column("u1", "bytes of the encoded image, as in a file")
     stamp_ns: int = attribute("when the middle of it was exposed, on the LiDAR's clock, ns")

@@ -37,7 +37,8 @@ class Topic(_Entry):
 
     name: str
     type: str
-    role: Literal["lidar", "imu", "gnss", "wheel", "images", "tf", "unused"]
+    role: Literal["lidar", "imu", "gnss", "wheel", "images", "camera", "tf", "unused"]
+    """`camera` holds models of cameras (camera info), `images` what they saw."""
     messages: int
     rate_hz: float
     first_ns: int

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from scanloom.pipeline.node import Node, node
 from scanloom.schemas.base import Base, BaseLog
+from scanloom.schemas.cameras import Cameras, Images
 from scanloom.schemas.changes import ChangeFiles, Changes
 from scanloom.schemas.clean import ClassCounts, Cleared, FinalLabels, Rays
 from scanloom.schemas.evaluation import ErrorTrack, Metrics, PictureFiles, ReportFiles
@@ -24,6 +25,7 @@ from scanloom.stages.denoise import denoise
 from scanloom.stages.deskew import deskew
 from scanloom.stages.evaluation import evaluation
 from scanloom.stages.fusion import fusion
+from scanloom.stages.images import images
 from scanloom.stages.ingest import ingest
 from scanloom.stages.loops.closing import loops
 from scanloom.stages.loops.places import places
@@ -46,6 +48,7 @@ NODES: tuple[Node, ...] = (
     node("base",       base,       per="session", reads=(BaseLog,),                            writes=Base),
     node("truth",      truth,      per="session", reads=(TruthLog,),                           writes=Truth),
     node("ingest",     ingest,     per="session", reads=(RawLog,),                             writes=(Scans, Imu, Gnss, Wheel, Session)),
+    node("images",     images,     per="session", reads=(RawLog, Session),                     writes=(Images, Cameras)),
     node("sensors",    sensors,    per="session", reads=(Scans, Session, Imu, Wheel),          writes=SensorCheck),
     node("deskew",     deskew,     per="chunk",   reads=(Scans, Session, Imu, Wheel, SensorCheck), writes=Deskewed),
     node("denoise",    denoise,    per="chunk",   reads=(Deskewed, Session, Imu, Wheel, SensorCheck), writes=Labels),

@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from scanloom.schemas.cameras import Camera
 from scanloom.schemas.errors import InvalidInput
 from scanloom.schemas.session import Extrinsic, Problem, RawLog
 from scanloom.stages.logs.containers import Channel, Container
@@ -33,6 +34,7 @@ class BagLog:
     format: str
     files: list[Container]
     extrinsics: tuple[Extrinsic, ...] = ()
+    cameras: tuple[Camera, ...] = ()
     topics: tuple[TopicInfo, ...] = ()
     opening: Damage = field(default_factory=Damage)
     unstamped: Counter[str] = field(default_factory=Counter)
@@ -78,9 +80,7 @@ class BagLog:
         wanted = {
             number
             for number, channel in channels.items()
-            if channel.topic in topics
-            and channel.encoding in _ENCODINGS
-            and kind_of(channel.type) not in ("other", "images")
+            if channel.topic in topics and channel.encoding in _ENCODINGS and kind_of(channel.type) != "other"
         }
         seen: Counter[int] = Counter()
         for raw in file.read(wanted):

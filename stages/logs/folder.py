@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 
+from scanloom.schemas.cameras import Camera
 from scanloom.schemas.session import Extrinsic, Problem, Severity
-from scanloom.stages.logs.records import CloudFile, Damage, GnssSample, ImuSample, Message, TopicInfo
+from scanloom.stages.logs.records import (
+    CloudFile,
+    Damage,
+    GnssSample,
+    ImageFile,
+    ImuSample,
+    Message,
+    TopicInfo,
+)
+
+Timed = ImuSample | GnssSample | ImageFile
 
 
 class FolderLog:
@@ -18,22 +29,27 @@ class FolderLog:
         self,
         format_name: str,
         scans: list[CloudFile],
-        others: dict[str, list[ImuSample] | list[GnssSample]],
+        others: Mapping[str, Sequence[ImuSample] | Sequence[GnssSample]],
         extrinsics: tuple[Extrinsic, ...] = (),
         problems: tuple[Problem, ...] = (),
         *,
         scan_topic: str,
+        images: dict[str, list[ImageFile]] | None = None,
+        cameras: tuple[Camera, ...] = (),
     ) -> None:
         self.format = format_name
         self.extrinsics = extrinsics
         self.problems = problems
+        self.cameras = cameras
         self.damage = Damage()
         self._scan_topic = scan_topic
         self._scans = scans
-        self._others = others
+        self._others: dict[str, Sequence[Timed]] = {**others, **(images or {})}
         stamps = {scan_topic: [scan.stamp_ns for scan in scans]}
         stamps |= {
-            topic: [sample.stamp_ns for sample in samples] for topic, samples in others.items() if samples
+            topic: [sample.stamp_ns for sample in samples]
+            for topic, samples in self._others.items()
+            if samples
         }
         self.topics = tuple(_topic(name, scan_topic, values) for name, values in stamps.items() if values)
 
@@ -55,6 +71,8 @@ def _topic(name: str, scan_topic: str, stamps: list[int]) -> TopicInfo:
         return TopicInfo(
             name, "sensor_msgs/msg/PointCloud2", "cloud", len(stamps), ordered[0], ordered[-1], period
         )
+    if name.startswith("image_"):
+        return TopicInfo(name, "image files", "images", len(stamps), ordered[0], ordered[-1], period)
     if name.endswith("imu"):
         return TopicInfo(name, "sensor_msgs/msg/Imu", "imu", len(stamps), ordered[0], ordered[-1], period)
     return TopicInfo(name, "sensor_msgs/msg/NavSatFix", "gnss", len(stamps), ordered[0], ordered[-1], period)

@@ -17,6 +17,7 @@ from scanloom.schemas.errors import InvalidInput
 from scanloom.schemas.session import Problem, RawLog
 from scanloom.stages.geometry.sweep import CLOCKWISE, Sweep, rings_by_wrap
 from scanloom.stages.logs.folder import FolderLog, problem, ranges
+from scanloom.stages.logs.kitti_cameras import odometry_cameras, odometry_images, raw_cameras, raw_images
 from scanloom.stages.logs.oxts import (
     GNSS,
     IMU,
@@ -120,6 +121,8 @@ def _open_raw(log: RawLog, found: list[re.Match[str]]) -> FolderLog:
     if len(oxts.stamp_ns):
         text = "heights of KITTI are above sea level, about 48 m less than above the ellipsoid; taken as they are"
         problems.append(problem("kitti.height", "info", text, GNSS))
+    images = raw_images(log, drive, problems)
+    cameras = raw_cameras(log, images, problems)
     return FolderLog(
         "kitti raw",
         scans,
@@ -127,6 +130,8 @@ def _open_raw(log: RawLog, found: list[re.Match[str]]) -> FolderLog:
         extrinsics(T_velo_imu, source),
         tuple(problems),
         scan_topic=SCANS,
+        images=images,
+        cameras=cameras,
     )
 
 
@@ -139,7 +144,11 @@ def _open_odometry(log: RawLog, found: list[re.Match[str]]) -> FolderLog:
             problem("kitti.timestamps_missing", "warning", "times.txt is missing; 10 Hz is assumed")
         )
     scans = _scans(log, files, times, problems, read_compensated)
-    return FolderLog("kitti odometry", scans, {}, (), tuple(problems), scan_topic=SCANS)
+    images = odometry_images(log, drive, times or {number: number * SCAN_PERIOD_NS for number in files})
+    cameras = odometry_cameras(log, images)
+    return FolderLog(
+        "kitti odometry", scans, {}, (), tuple(problems), scan_topic=SCANS, images=images, cameras=cameras
+    )
 
 
 def _one_drive(found: list[re.Match[str]], problems: list[Problem]) -> tuple[str, dict[int, str]]:

@@ -18,6 +18,8 @@ ACCEPTED = (
 SESSION_FILES = ("session.yaml", "session.yml")
 _DEEPEST = 2
 _TRUTH_NAMES = ("truth", "ground_truth", "gt")
+_KITTI_PARTS = ("/velodyne_points/", "/oxts/", "/image_00/", "/image_01/", "/image_02/", "/image_03/")
+_PICTURES = (".png", ".jpg")
 _MAGICS = {
     ".bag": (b"#ROSBAG V2.0", b"#ROSBAG V1"),
     ".mcap": (b"\x89MCAP0\r\n",),
@@ -171,13 +173,11 @@ def _kitti_raw(path: Path, files: Sequence[Path]) -> Located | None:
         )
     drive = drives[0].resolve()
     root = drive.parent
-    inside = [
-        p.relative_to(root).as_posix() for p in _walk(drive) if "image_" not in p.relative_to(root).as_posix()
-    ]
+    inside = [p.relative_to(root).as_posix() for p in _walk(drive)]
     calibration = [p.name for p in sorted(root.glob("calib_*.txt"))]
     oxts = tuple(name for name in inside if "/oxts/" in name)
     imu_to_velo = tuple(name for name in calibration if name == "calib_imu_to_velo.txt")
-    scans = tuple(name for name in inside if "/velodyne_points/" in name or "/oxts/" in name)
+    scans = tuple(name for name in inside if any(part in name for part in _KITTI_PARTS))
     truth = TruthLog(root, (*oxts, *imu_to_velo)) if oxts else TruthLog()
     return Located(drive.name, "kitti raw", RawLog(root, tuple(sorted((*scans, *calibration)))), truth)
 
@@ -192,6 +192,9 @@ def _kitti_odometry(path: Path, files: Sequence[Path]) -> Located | None:
     root = path.resolve()
     scans = [f"velodyne/{p.name}" for p in sorted((root / "velodyne").glob("*.bin"))]
     extra = [name for name in ("times.txt", "calib.txt") if (root / name).is_file()]
+    images = [
+        f"{p.parent.name}/{p.name}" for p in sorted(root.glob("image_[0-3]/*")) if p.suffix in _PICTURES
+    ]
     poses = [
         p for p in (root / "poses.txt", root.parent.parent / "poses" / f"{root.name}.txt") if p.is_file()
     ]
@@ -200,7 +203,7 @@ def _kitti_odometry(path: Path, files: Sequence[Path]) -> Located | None:
         truth_root = root if poses[0].parent == root else root.parent.parent
         names = [poses[0], *(root / name for name in extra)]
         truth = TruthLog(truth_root, tuple(p.relative_to(truth_root).as_posix() for p in names))
-    return Located(f"kitti-{root.name}", "kitti odometry", RawLog(root, (*scans, *extra)), truth)
+    return Located(f"kitti-{root.name}", "kitti odometry", RawLog(root, (*scans, *extra, *images)), truth)
 
 
 # -- bags and scans -----------------------------------------------------------------------------------------------------

@@ -7,14 +7,14 @@ Sources: OMG CDR (DDSI-RTPS 2.5, section 10), the ROS 1 wiki page "Messages/Seri
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
 from scanloom.stages.geometry.se3 import F8, matrix_from_quaternion, pose
+from scanloom.stages.logs import image_messages
 from scanloom.stages.logs.containers import MAX_MESSAGE_BYTES, decompress_zstd
+from scanloom.stages.logs.cursor import Cursor
 from scanloom.stages.logs.records import (
     LIVOX_POINT,
     Body,
@@ -29,81 +29,6 @@ from scanloom.stages.logs.records import (
     Undecodable,
     WheelSample,
 )
-
-_MAX_NAME = 4096
-_MAX_ITEMS = 4096
-
-
-class Cursor:
-    """Reads primitives one after the other. Raises ValueError where the bytes end or make no sense."""
-
-    __slots__ = ("_align_max", "_base", "at", "data", "order", "ros1")
-
-    def __init__(self, data: memoryview, encoding: str) -> None:
-        self.data = data
-        self.ros1 = encoding == "ros1"
-        self.order = "<"
-        self.at = self._base = 0
-        self._align_max = 1 if self.ros1 else 8
-        if not self.ros1:
-            if len(data) < 4:
-                raise ValueError("message is empty")
-            # encapsulation: 0/1 CDR big/little endian, 6/7 plain CDR2 (aligned to 4 at most)
-            kind = data[1]
-            if data[0] != 0 or kind not in (0, 1, 6, 7):
-                raise ValueError(f"unknown CDR encapsulation {data[0]:02x}{kind:02x}")
-            self.order = "<" if kind & 1 else ">"
-            self._align_max = 4 if kind > 5 else 8
-            self.at = self._base = 4
-
-    def read(self, code: str, count: int = 1) -> tuple[Any, ...]:
-        """`count` primitives of one struct code, aligned to their own size."""
-        size = struct.calcsize(code)
-        self.align(size)
-        try:
-            values = struct.unpack_from(f"{self.order}{count}{code}", self.data, self.at)
-        except struct.error as error:
-            raise ValueError("message ends early") from error
-        self.at += size * count
-        return values
-
-    def align(self, size: int) -> None:
-        step = min(size, self._align_max)
-        self.at += -(self.at - self._base) % step
-
-    def number(self, code: str) -> Any:
-        return self.read(code)[0]
-
-    def doubles(self, count: int) -> tuple[float, ...]:
-        return self.read("d", count)
-
-    def length(self, limit: int = _MAX_ITEMS) -> int:
-        count = int(self.number("I"))
-        if count > limit:
-            raise ValueError(f"a length of {count} makes no sense here")
-        return count
-
-    def text(self) -> str:
-        raw = self.take(self.length(_MAX_NAME))
-        return bytes(raw).rstrip(b"\0").decode("utf-8", "replace")
-
-    def take(self, count: int) -> memoryview:
-        if self.at + count > len(self.data):
-            raise ValueError("message ends early")
-        piece = self.data[self.at : self.at + count]
-        self.at += count
-        return piece
-
-    def time_ns(self) -> int:
-        seconds, nanoseconds = self.number("I" if self.ros1 else "i"), self.number("I")
-        return int(seconds) * 1_000_000_000 + int(nanoseconds)
-
-    def header(self) -> tuple[int, str]:
-        """Stamp in ns and frame, without the leading slash of old tf."""
-        if self.ros1:
-            self.number("I")
-        stamp_ns = self.time_ns()
-        return stamp_ns, self.text().lstrip("/")
 
 
 def _imu(c: Cursor, receive_ns: int) -> Body:
@@ -218,8 +143,10 @@ _DECODERS: dict[str, tuple[Kind, Callable[[Cursor, int], Body]]] = {
     "geometry_msgs/TwistWithCovarianceStamped": ("wheel", _twist),
     "tf2_msgs/TFMessage": ("tf", _tf),
     "tf/tfMessage": ("tf", _tf),
+    "sensor_msgs/Image": ("images", image_messages.raw_image),
+    "sensor_msgs/CompressedImage": ("images", image_messages.compressed_image),
+    "sensor_msgs/CameraInfo": ("camera", image_messages.camera_info),
 }
-_IMAGES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage")
 
 
 def ros2_name(type_name: str) -> str:
@@ -235,9 +162,7 @@ def _short(type_name: str) -> str:
 def kind_of(type_name: str) -> Kind:
     """What a topic of this type may be used for."""
     short = _short(type_name)
-    if short in _DECODERS:
-        return _DECODERS[short][0]
-    return "images" if short in _IMAGES else "other"
+    return _DECODERS[short][0] if short in _DECODERS else "other"
 
 
 def decode(data: memoryview, type_name: str, encoding: str, topic: str, receive_ns: int) -> Body:

@@ -46,6 +46,13 @@ class TfTree:
             graph.setdefault(child, []).append((parent, inverse(T)))
         return graph
 
+    def between(self, start: str, end: str) -> F8 | None:
+        """T_start_end where edges that do not move join the frames."""
+        if start == end and start:
+            return np.eye(4)
+        graph = self.rigid()
+        return _reach(graph, start).get(end) if start in graph else None
+
     def root_of(self, frame: str) -> str:
         """Topmost frame above `frame` that is rigidly joined to it."""
         above = {c: p for p, c in self.edges if (p, c) not in self.moving and p not in _WORLDS}
@@ -142,11 +149,21 @@ def _problems(assumed: list[str], frames: Mapping[str, str], base: str) -> list[
 
 
 def _given(values: tuple[float, ...]) -> Matrix4:
+    return _tuple(pose_of_numbers(values))
+
+
+def pose_of_numbers(values: Sequence[float]) -> F8:
+    """A pose of 6 numbers (x, y, z in m, roll, pitch, yaw in rad) or 16 (row by row)."""
     if len(values) == 16:
-        return _tuple(np.reshape(values, (4, 4)))
+        return np.reshape(np.array(values, float), (4, 4))
     x, y, z, roll, pitch, yaw = values
     R = so3_exp([0, 0, yaw]) @ so3_exp([0, pitch, 0]) @ so3_exp([roll, 0, 0])
-    return _tuple(pose(R, [x, y, z]))
+    return pose(R, [x, y, z])
+
+
+def as_matrix4(T: F8 | None) -> Matrix4 | None:
+    """A pose as plain numbers; nothing stays nothing."""
+    return None if T is None else _tuple(T)
 
 
 def _tuple(T: F8) -> Matrix4:

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scanloom.schemas.cameras import Camera
 from scanloom.schemas.session import Extrinsic, Problem
 from scanloom.stages.geometry.se3 import F8
 from scanloom.stages.geometry.sweep import Sweep
@@ -175,6 +177,67 @@ class Transforms:
 
 
 @dataclass(frozen=True)
+class RawImage:
+    """A sensor_msgs/Image as it came, its bytes not copied."""
+
+    stamp_ns: int
+    receive_ns: int
+    frame_id: str
+    height: int
+    width: int
+    encoding: str
+    is_bigendian: bool
+    step: int
+    data: NDArray[np.uint8]
+    """Read-only; may be shorter or longer than `height * step` (the packer checks)."""
+
+
+@dataclass(frozen=True)
+class CompressedImage:
+    """A sensor_msgs/CompressedImage as it came."""
+
+    stamp_ns: int
+    receive_ns: int
+    frame_id: str
+    format: str
+    """`jpeg`, `png`, `bayer_rggb8; png compressed`, ...: what the driver wrote, not what the bytes say."""
+    data: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class ImageFile:
+    """An image in a file of its own."""
+
+    stamp_ns: int
+    receive_ns: int
+    path: Path
+    frame_id: str = ""
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """A sensor_msgs/CameraInfo; `K`, `R` and `P` row by row."""
+
+    stamp_ns: int
+    receive_ns: int
+    frame_id: str
+    height: int
+    width: int
+    lens: str
+    """The driver's name of the distortion model, for instance `plumb_bob`."""
+    distortion: tuple[float, ...]
+    K: tuple[float, ...]
+    R: tuple[float, ...]
+    P: tuple[float, ...]
+    binning: tuple[int, int]
+    offset_px: tuple[int, int]
+    """Upper left corner of the region of interest, in pixels of the whole sensor."""
+
+
+AnyImage = RawImage | CompressedImage | ImageFile
+
+
+@dataclass(frozen=True)
 class Undecodable:
     """A message of a known type whose bytes do not fit the type; counted and left out."""
 
@@ -183,7 +246,18 @@ class Undecodable:
     reason: str
 
 
-Body = PointCloud2 | LivoxCloud | CloudFile | ImuSample | GnssSample | WheelSample | Transforms | Undecodable
+Body = (
+    PointCloud2
+    | LivoxCloud
+    | CloudFile
+    | ImuSample
+    | GnssSample
+    | WheelSample
+    | Transforms
+    | AnyImage
+    | CameraInfo
+    | Undecodable
+)
 
 
 class Message(NamedTuple):
@@ -193,7 +267,7 @@ class Message(NamedTuple):
     body: Body
 
 
-Kind = Literal["cloud", "imu", "gnss", "wheel", "tf", "images", "other"]
+Kind = Literal["cloud", "imu", "gnss", "wheel", "tf", "images", "camera", "other"]
 
 
 @dataclass(frozen=True)
@@ -239,6 +313,10 @@ class LogSource(Protocol):
     @property
     def extrinsics(self) -> tuple[Extrinsic, ...]:
         """What the log knows besides tf (KITTI calibration); empty for bags."""
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """What the log knows of its cameras besides camera info (KITTI calibration), each by its topic as name."""
 
     @property
     def problems(self) -> tuple[Problem, ...]:

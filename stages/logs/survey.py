@@ -307,16 +307,17 @@ def _table(values: array[float], width: int) -> F8:
     return np.array(values, np.float64).reshape(-1, width)
 
 
-TopicRole = Literal["lidar", "imu", "gnss", "wheel", "images", "tf", "unused"]
+TopicRole = Literal["lidar", "imu", "gnss", "wheel", "images", "camera", "tf", "unused"]
 
 
 def _role(used: str | None, kind: str) -> TopicRole:
     for role in ("lidar", "imu", "gnss", "wheel"):
         if used == role:
             return role
-    if kind == "tf":
-        return "tf"
-    return "images" if kind == "images" else "unused"
+    for other in ("tf", "images", "camera"):
+        if kind == other:
+            return other
+    return "unused"
 
 
 def _rate_hz(topic: TopicInfo) -> float:

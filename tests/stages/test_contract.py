@@ -28,6 +28,7 @@ WITHOUT_INPUT = {"simulate"}
 CONTENT_WITH_NOTHING = {
     "base",
     "changes",
+    "images",
     "truth",
     "overview",
     "tiles",
