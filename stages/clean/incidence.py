@@ -21,7 +21,7 @@ LOWEST_RAD, HIGHEST_RAD = np.radians(-56.0), np.radians(56.0)
 ROW_RAD = (HIGHEST_RAD - LOWEST_RAD) / ROWS
 BESIDE, ABOVE = 2, 5
 """Cells to each side, and upwards and downwards, in which the next return is looked for."""
-LEAST_SINE = 0.02
+LEAST_SINE, NONE = 0.02, 2.0
 ZERO, HALF, WHOLE, ENDLESS = (np.float32(c) for c in (0.0, 0.5, 1.0, np.inf))
 LOWEST_TURN, ROWS_PER_TURN = np.float32(LOWEST_RAD / (2.0 * np.pi)), np.float32(2.0 * np.pi / ROW_RAD)
 COLUMNS_PER_TURN, LAST_COLUMN = np.float32(COLUMNS), np.int32(COLUMNS - 1)
@@ -63,48 +63,49 @@ def clear_ranges(x: F4, y: F4, z: F4, cell: I4, image: I4, clearance_m: float) -
         if cell[n] < 0:
             continue
         row, column = cell[n] >> COLUMN_BITS, cell[n] & LAST_COLUMN
-        sine = min(_beside(x, y, z, n, row, column, image), _above(x, y, z, n, row, column, image))
         px, py, pz = float(x[n]), float(y[n]), float(z[n])
-        r = np.sqrt(px * px + py * py + pz * pz)
-        out[n] = r - clearance_m / max(sine, LEAST_SINE)
+        square = px * px + py * py + pz * pz
+        beside = _beside(x, y, z, n, square, row, column, image)
+        along = max(beside, _above(x, y, z, n, square, row, column, image))
+        sine = np.sqrt(max(1.0 - along, 0.0))
+        out[n] = np.sqrt(square) - clearance_m / max(sine, LEAST_SINE)
     return out
 
 
 @kernel
-def _beside(x: F4, y: F4, z: F4, n: int, row: int, column: int, image: I4) -> float:
-    """Sine of the angle between ray and surface, by the returns left and right; of the steeper side at an edge."""
-    best = -1.0
+def _beside(x: F4, y: F4, z: F4, n: int, square: float, row: int, column: int, image: I4) -> float:
+    """Square of the cosine of the angle between ray and surface, by the returns left and right; of the steeper side at an
+    edge."""
+    best = NONE
     for side in (-1, 1):
         for step in range(1, BESIDE + 1):
             other = image[row, (column + side * step) & LAST_COLUMN]
             if other >= 0:
-                best = max(best, _sine(x, y, z, n, other))
+                best = min(best, _cosine2(x, y, z, n, square, other))
                 break
-    return best if best >= 0.0 else 1.0
+    return best if best < NONE else 0.0
 
 
 @kernel
-def _above(x: F4, y: F4, z: F4, n: int, row: int, column: int, image: I4) -> float:
+def _above(x: F4, y: F4, z: F4, n: int, square: float, row: int, column: int, image: I4) -> float:
     """The same by the returns above and below."""
-    best = -1.0
+    best = NONE
     for side in (-1, 1):
         for step in range(1, ABOVE + 1):
             if not 0 <= row + side * step < ROWS:
                 break
             other = image[row + side * step, column]
             if other >= 0:
-                best = max(best, _sine(x, y, z, n, other))
+                best = min(best, _cosine2(x, y, z, n, square, other))
                 break
-    return best if best >= 0.0 else 1.0
+    return best if best < NONE else 0.0
 
 
 @kernel
-def _sine(x: F4, y: F4, z: F4, n: int, other: int) -> float:
-    """Sine of the angle between the ray to a return and the line from it to another return."""
+def _cosine2(x: F4, y: F4, z: F4, n: int, square: float, other: int) -> float:
+    """Square of the cosine of the angle between the ray to a return, `square` m2 away, and the line to another return."""
     px, py, pz = float(x[n]), float(y[n]), float(z[n])
     dx, dy, dz = float(x[other]) - px, float(y[other]) - py, float(z[other]) - pz
-    square = (dx * dx + dy * dy + dz * dz) * (px * px + py * py + pz * pz)
-    if not square > 0.0:
-        return 1.0
+    both = (dx * dx + dy * dy + dz * dz) * square
     along = dx * px + dy * py + dz * pz
-    return float(np.sqrt(max(1.0 - along * along / square, 0.0)))
+    return along * along / both if both > 0.0 else 0.0

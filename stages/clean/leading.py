@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from scanloom.stages.clean.incidence import COLUMNS, ROW_RAD, ROWS
 from scanloom.stages.geometry.kernels import kernel
+from scanloom.stages.geometry.voxels import Int
 
 F4 = NDArray[np.float32]
 I4 = NDArray[np.int32]
@@ -19,6 +20,9 @@ LEVELS = 5
 WIDTH_SHARE = 0.5
 """Width of a cell over that of a voxel, at most: leaders of neighbouring cells are then less than a voxel apart. Of what all
 rays together see through, 0.1 % is missed."""
+WIDEST = 1 << (LEVELS - 1)
+"""Cells of the image along each side of one of the widest."""
+NO_CELL, LAST_CELL = np.int32(-1), np.int32(ROWS * COLUMNS - 1)
 CELL_RAD = max(ROW_RAD, 2.0 * np.pi / COLUMNS)
 
 
@@ -29,16 +33,29 @@ def followed_since(cell: I4, clear_m: F4, voxel_m: float) -> F4:
     `cell` (n,) is the ray's cell in the image of directions, `clear_m` (n,) how far it reaches.
     """
     since = np.zeros(len(cell), np.float32)
-    leader = np.full((ROWS, COLUMNS), -1, np.int32)
+    first, rows = _rows_used(cell)
+    leader = np.full((rows, COLUMNS), -1, np.int32)
     flat = leader.reshape(-1)
     reach = WIDTH_SHARE * voxel_m / CELL_RAD
     for n in range(len(cell)):
         if cell[n] >= 0:
-            flat[cell[n]] = _farther(flat[cell[n]], n, clear_m, since, reach)
+            k = cell[n] - first * COLUMNS
+            flat[k] = _farther(flat[k], n, clear_m, since, reach)
     for _ in range(1, LEVELS):
         reach *= 0.5
         leader = _merged(leader, clear_m, since, reach)
     return since
+
+
+@kernel
+def _rows_used(cell: I4) -> tuple[Int, Int]:
+    """First row of the image, and number of rows, in which there is something; both can be halved at every level."""
+    low, high = NO_CELL, NO_CELL
+    for n in range(len(cell)):
+        high = max(high, cell[n])
+        low = max(low, LAST_CELL - cell[n] if cell[n] >= 0 else NO_CELL)
+    first, last = (LAST_CELL - low) // COLUMNS // WIDEST, high // COLUMNS // WIDEST
+    return (first * WIDEST, (last - first + 1) * WIDEST) if high >= 0 else (0, WIDEST)
 
 
 @kernel

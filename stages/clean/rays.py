@@ -26,11 +26,13 @@ from scanloom.stages.clean.field import Field as VoxelField
 from scanloom.stages.clean.leading import followed_since
 from scanloom.stages.clean.moving import MovingBoxes, boxed
 from scanloom.stages.clean.tiles import bricks_by_tile
-from scanloom.stages.clean.walking import mark_hits, walk
+from scanloom.stages.clean.walking import counted, mark_hits, walk
 
 VERSION = 1
 
-SEEN = (PointClass.UNLABELLED, PointClass.GROUND, PointClass.STATIC, PointClass.DYNAMIC)
+SEEN = np.isin(
+    list(PointClass), (PointClass.UNLABELLED, PointClass.GROUND, PointClass.STATIC, PointClass.DYNAMIC)
+)
 """Classes whose returns end a ray; those of dust, strays and the own vehicle say nothing."""
 
 
@@ -100,9 +102,8 @@ def _bins(deskewed: Deskewed, labels: Labels, bin_s: float) -> Iterator[list[Pai
 
 def _seen(scan: DeskewedScan, label: ScanLabels, tracked: np.ndarray) -> tuple[np.ndarray, ...]:
     """x, y, z, class and whether it moved (n,) of the returns that count."""
-    rows = np.flatnonzero(np.isin(label.class_, SEEN))
-    moved = tracked | (label.class_ == PointClass.DYNAMIC)
-    return tuple(np.ascontiguousarray(c[rows]) for c in (scan.x_m, scan.y_m, scan.z_m, label.class_, moved))
+    found: tuple[np.ndarray, ...] = counted(scan.x_m, scan.y_m, scan.z_m, label.class_, tracked, SEEN)
+    return found
 
 
 def _mark(settings: Settings, field: VoxelField, image: np.ndarray, placed: list[tuple]) -> None:

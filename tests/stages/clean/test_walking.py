@@ -10,6 +10,7 @@ from scanloom.stages.clean.field import (
     AFTER,
     BEFORE,
     BETWEEN,
+    BLOCKED,
     FIRST_BRICKS,
     HITS,
     SATURATED,
@@ -22,7 +23,7 @@ from scanloom.stages.clean.field import (
 from scanloom.stages.clean.incidence import COLUMNS, LOWEST_RAD, ROW_RAD, ROWS, clear_ranges, fill, new_image
 from scanloom.stages.clean.leading import CELL_RAD, WIDTH_SHARE, followed_since
 from scanloom.stages.clean.tiles import brick_indices, bricks_by_tile
-from scanloom.stages.clean.walking import NEAREST_M, mark_hits, walk
+from scanloom.stages.clean.walking import NEAREST_M, counted, mark_hits, walk
 from scanloom.stages.geometry.se3 import F8, pose, so3_exp
 from scanloom.stages.geometry.voxels import pack
 
@@ -264,3 +265,71 @@ def test_cells_are_those_of_exact_angles_but_at_borders() -> None:
     nearest = np.full(ROWS * COLUMNS, np.inf, np.float32)
     np.minimum.at(nearest, cell[cell >= 0], away_m[cell >= 0])
     assert np.array_equal(away_m[first], nearest[cell[first]])
+
+
+def test_what_is_blocked_reaches_into_bricks_around() -> None:
+    field = Field()
+    at = np.array([[i, j, k] for i in (7, 8, 11) for j in (15, 20) for k in (-8, -1, 4)])
+    points = ((at + 0.5) * VOXEL_M - ORIGIN[:3, 3]) @ ORIGIN[:3, :3]
+    marked(field, points)
+    blocked = set()
+    for row, corner in enumerate(8 * brick_indices(field.bricks)):
+        for q in np.flatnonzero(field.now[row] & BLOCKED):
+            blocked.add(tuple(int(v) for v in np.add(corner, [q >> 6, (q >> 3) & 7, q & 7])))
+    beside = np.array(list(np.ndindex(3, 3, 3))) - 1
+    assert blocked == {tuple(int(v) for v in each + b) for each in at for b in beside}
+
+
+def test_returns_that_count_come_with_whether_they_moved() -> None:
+    rng = np.random.default_rng(1)
+    points, classes = rng.normal(size=(500, 3)), rng.integers(0, 9, 500).astype(np.uint8)
+    tracked, seen = rng.random(500) < 0.3, np.arange(9) % 2 == 1
+    x, y, z, of, moved = counted(*columns(points), classes, tracked, seen)
+    rows = classes % 2 == 1
+    assert np.array_equal(np.column_stack((x, y, z)), points[rows].astype(np.float32))
+    assert np.array_equal(of, classes[rows])
+    assert np.array_equal(moved, (tracked | (classes == PointClass.DYNAMIC))[rows])
+    assert 0 < moved.sum() < len(moved)
+
+
+def test_leaders_are_found_at_either_end_of_the_image() -> None:
+    last = ROWS * COLUMNS - 1
+    for cell in ([0, 0], [last, last], [0, 0, last, last], [16 * COLUMNS - 1, 16 * COLUMNS - 1]):
+        clear = np.arange(1.0, len(cell) + 1, dtype=np.float32)
+        since = followed_since(np.array(cell, np.int32), clear, VOXEL_M)
+        assert since[::2] == pytest.approx(WIDTH_SHARE * VOXEL_M / CELL_RAD)
+        assert (since[1::2] == 0.0).all()
+    assert (followed_since(np.full(3, -1, np.int32), np.ones(3, np.float32), VOXEL_M) == 0.0).all()
+
+
+def test_a_ray_is_free_up_to_where_it_comes_close_to_what_its_neighbours_show() -> None:
+    """Against the angles between rays and the lines to the next returns, one by one."""
+    rng = np.random.default_rng(5)
+    row, column = np.meshgrid(np.arange(100, 110), np.arange(300, 340), indexing="ij")
+    kept = rng.random(row.size) < 0.8
+    row, column = row.ravel()[kept], column.ravel()[kept]
+    up, turn = LOWEST_RAD + (row + 0.5) * ROW_RAD, (column + 0.5) * 2 * np.pi / COLUMNS
+    way = np.column_stack((np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)))
+    points = rng.uniform(9.0, 11.0, len(way))[:, None] * way
+    image = new_image()
+    cell, _ = fill(*columns(points), image)
+    assert np.array_equal(cell, row * COLUMNS + column)
+    points, clear = (
+        points.astype(np.float32).astype(float),
+        clear_ranges(*columns(points), cell, image, 0.3),
+    )
+
+    def sine(n: int, steps: list[tuple[int, int]]) -> float | None:
+        found = (image[row[n] + i, (column[n] + j) % COLUMNS] for i, j in steps)
+        other = next((int(m) for m in found if m >= 0), None)
+        if other is None:
+            return None
+        across = np.linalg.norm(np.cross(points[other] - points[n], points[n]))
+        return float(across / np.linalg.norm(points[other] - points[n]) / np.linalg.norm(points[n]))
+
+    for n in range(len(points)):
+        beside = [sine(n, [(0, side), (0, 2 * side)]) for side in (-1, 1)]
+        above = [sine(n, [(side * i, 0) for i in range(1, 6)]) for side in (-1, 1)]
+        steeper = [max((s for s in pair if s is not None), default=1.0) for pair in (beside, above)]
+        expected = np.linalg.norm(points[n]) - 0.3 / max(min(steeper), 0.02)
+        assert clear[n] == pytest.approx(expected, abs=1e-3)
