@@ -8,11 +8,14 @@ from typing import Any
 
 from scanloom.pipeline.settings import resolve
 from scanloom.schemas.errors import EXIT_INVALID_INPUT, EXIT_OK
+from scanloom.stages.images import Settings as ImageSettings
 from scanloom.stages.ingest import Settings
-from scanloom.stages.logs.inspection import Inspection, inspect_log
+from scanloom.stages.logs.inspection import InspectedCamera, Inspection, inspect_log
 from scanloom.workflows.configuration import Overrides
 from scanloom.workflows.map_session import NODES
 
+READING = ("ingest", "images")
+"""Stages that read the log."""
 MARKS = {"error": "ERROR", "warning": "warn ", "info": "note "}
 
 
@@ -24,9 +27,13 @@ def inspection_of(session: str, overrides: Overrides) -> Inspection:
     InvalidInput : it is no log at all.
     UsageError : a setting is wrong.
     """
-    ingest = tuple(n for n in NODES if n.name == "ingest")
-    settings = resolve(ingest, [("--set", overrides)])["ingest"]
-    return inspect_log(Path(session), settings if isinstance(settings, Settings) else None)
+    settings = resolve(tuple(n for n in NODES if n.name in READING), [("--set", overrides)])
+    ingest, images = (settings[name] for name in READING)
+    return inspect_log(
+        Path(session),
+        ingest if isinstance(ingest, Settings) else None,
+        images if isinstance(images, ImageSettings) else None,
+    )
 
 
 def exit_code_of(found: Inspection) -> int:
@@ -45,6 +52,7 @@ def text_of(found: Inspection) -> str:
     lines += [_topic_line(topic) for topic in found.topics]
     lines += ["", _scans_line(found)]
     lines += [f"extrinsics of {e.sensor}: {e.source}" for e in found.extrinsics]
+    lines += [_camera_line(camera) for camera in found.cameras]
     if found.missing:
         lines.append(f"not in this log: {', '.join(found.missing)}")
     if found.truth:
@@ -64,6 +72,16 @@ def _topic_line(topic: Any) -> str:
     used = "" if topic.role == "unused" else topic.role
     remark = f"  ({topic.remark})" if topic.remark else ""
     return f"  {topic.name:34} {topic.type:34} {topic.messages:8} {topic.rate_hz:6.1f} Hz  {used}{remark}"
+
+
+def _camera_line(camera: InspectedCamera) -> str:
+    size = f" of {camera.width_px} x {camera.height_px} px" if camera.width_px else ""
+    if not camera.lens:
+        known = "not calibrated, not used"
+    else:
+        place = "" if camera.mounted else ", place on the LiDAR unknown"
+        known = f"{camera.lens} ({camera.source}){place}"
+    return f"camera {camera.name}: {camera.images} images{size} on {camera.topic}; {known}"
 
 
 def _scans_line(found: Inspection) -> str:

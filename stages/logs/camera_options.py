@@ -43,6 +43,8 @@ class GivenCamera(BaseModel):
     clock_offset_s: float = Field(default=0.0, ge=-1e10, le=1e10)
     readout_s: float = Field(default=0.0, ge=0.0, le=1.0)
     source: str = "session file"
+    remark: str = ""
+    """What its file leaves open or doubts, in a sentence."""
 
 
 class Settings(BaseModel):

@@ -93,6 +93,8 @@ def find_cameras(source: LogSource, settings: Settings) -> Cameras:
     if settings.use == "none":
         return cameras
     for camera in _chosen(source, settings, cameras.remarks):
+        if camera.given is not None and camera.given.remark:
+            cameras.remarks.append(camera.given.remark)
         camera = _looked_at(source, camera)
         camera = _with_model(source, camera, cameras.remarks)
         cameras.found.append(_of_that_size(camera, cameras.remarks))

@@ -6,13 +6,15 @@ import difflib
 from dataclasses import asdict, dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from scanloom.schemas.errors import InvalidInput, ScanloomError, UsageError
 from scanloom.schemas.session import Extrinsic, Problem, Session, Topic
-from scanloom.stages.logs.locate import locate
+from scanloom.stages.logs import camera_options
+from scanloom.stages.logs.cameras import FoundCamera, find_cameras, mount_cameras
+from scanloom.stages.logs.locate import Located, locate
 from scanloom.stages.logs.options import Settings
 from scanloom.stages.logs.reader import open_log
 from scanloom.stages.logs.records import CloudFile, LivoxCloud, LogSource, PointCloud2
@@ -20,6 +22,7 @@ from scanloom.stages.logs.roles import ROLES, assign_roles, no_lidar
 from scanloom.stages.logs.survey import Survey
 from scanloom.stages.logs.sweeps import CloudMessage, ScanMaker
 
+SettingsT = TypeVar("SettingsT", bound=BaseModel)
 _LOOKED_AT = 3
 _WEIGHT = {"error": 0, "warning": 1, "info": 2}
 _MISSING = {
@@ -27,6 +30,24 @@ _MISSING = {
     "gnss": "no GNSS: the map gets no georeference",
     "wheel": "no wheel speed: nothing helps where the scans see no structure along the road",
 }
+
+
+@dataclass(frozen=True)
+class InspectedCamera:
+    """A camera of the log and what is known of it."""
+
+    name: str
+    topic: str
+    images: int
+    width_px: int
+    """Of its images; 0 when none can be read."""
+    height_px: int
+    lens: str
+    """Empty when nothing tells it: the camera is not used then."""
+    mounted: bool
+    """Whether it is known where it sits on the LiDAR."""
+    source: str
+    """Where lens and mounting come from."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +74,7 @@ class Inspection:
     """Topic by role."""
     missing: tuple[str, ...]
     extrinsics: tuple[Extrinsic, ...]
+    cameras: tuple[InspectedCamera, ...]
     truth: tuple[str, ...]
     """Files with the true trajectory, for evaluation only."""
     problems: tuple[Problem, ...]
@@ -66,13 +88,16 @@ class Inspection:
         return plain
 
 
-def inspect_log(path: Path, settings: Settings | None = None) -> Inspection:
+def inspect_log(
+    path: Path, settings: Settings | None = None, images: camera_options.Settings | None = None
+) -> Inspection:
     """Look at a log without computing anything.
 
     Parameters
     ----------
     path : what the user calls a SESSION.
     settings : settings of ingest given by the user; those of a session file stand behind them.
+    images : settings of images, likewise.
 
     Raises
     ------
@@ -80,12 +105,16 @@ def inspect_log(path: Path, settings: Settings | None = None) -> Inspection:
     UsageError : the settings name a topic that the log does not have.
     """
     located = locate(path)
-    given = (settings or Settings()).model_dump(exclude_unset=True)
-    merged = _settings({**located.settings.get("ingest", {}), **given}, str(path))
+    merged = _merged("ingest", Settings, settings, located, str(path))
+    of_images = _merged("images", camera_options.Settings, images, located, str(path))
     source = open_log(located.raw_log, merged.scan_rate_hz)
-    session, error, used = _look(source, merged, str(path))
+    survey, session, error, used = _look(source, merged, str(path))
+    seen = find_cameras(source, of_images)
+    mount_cameras(seen, survey.tf, survey.tracks["lidar"].frame)
     sizes = [(located.raw_log.root or Path()) / name for name in located.raw_log.names]
-    problems = session.problems if error is None else (*session.problems, _as_problem(error))
+    problems = [*session.problems, *map(_camera_problem, seen.remarks)]
+    if error is not None:
+        problems.append(_as_problem(error))
     return Inspection(
         path=str(path),
         name=located.name,
@@ -105,26 +134,31 @@ def inspect_log(path: Path, settings: Settings | None = None) -> Inspection:
         used=used,
         missing=tuple(_MISSING[role] for role in _MISSING if role not in used) if "lidar" in used else (),
         extrinsics=session.extrinsics,
+        cameras=tuple(map(_inspected, seen.found)),
         truth=located.truth_log.names,
         problems=tuple(sorted(problems, key=lambda problem: _WEIGHT[problem.severity])),
         next_step=_next_step(path, session, error),
     )
 
 
-def _settings(values: dict[str, Any], where: str) -> Settings:
+def _merged(
+    stage: str, model: type[SettingsT], given: SettingsT | None, located: Located, where: str
+) -> SettingsT:
+    """The user's settings over those of the session file."""
+    values = {**located.settings.get(stage, {}), **(given or model()).model_dump(exclude_unset=True)}
     try:
-        return Settings.model_validate(values)
+        return model.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
-        near = difflib.get_close_matches(name, Settings.model_fields, 1, 0.4)
-        hint = f"did you mean ingest.{near[0]}?" if near and near[0] != name else "correct the session file"
-        raise UsageError(f"ingest.{name}: {first['msg']}", where=where, next_step=hint) from error
+        near = difflib.get_close_matches(name, model.model_fields, 1, 0.4)
+        hint = f"did you mean {stage}.{near[0]}?" if near and near[0] != name else "correct the session file"
+        raise UsageError(f"{stage}.{name}: {first['msg']}", where=where, next_step=hint) from error
 
 
 def _look(
     source: LogSource, settings: Settings, where: str
-) -> tuple[Session, ScanloomError | None, dict[str, str]]:
+) -> tuple[Survey, Session, ScanloomError | None, dict[str, str]]:
     """The session as ingest would find it, with points counted per scan; the error that ingest would raise."""
     roles = assign_roles(source, settings.wanted_topics())
     survey = Survey(source, roles, settings)
@@ -152,7 +186,25 @@ def _look(
             f"The log holds {readable} readable scan{'s' * (readable != 1)}; a map needs at least two.",
             where=where,
         )
-    return survey.session("", tally, survey.imu(), survey.gnss()), error, used
+    return survey, survey.session("", tally, survey.imu(), survey.gnss()), error, used
+
+
+def _inspected(camera: FoundCamera) -> InspectedCamera:
+    width, height = camera.size_px or (0, 0)
+    return InspectedCamera(
+        name=camera.name,
+        topic=camera.topic,
+        images=camera.images,
+        width_px=width,
+        height_px=height,
+        lens=camera.model.lens if camera.model else "",
+        mounted=camera.T_lidar_camera is not None,
+        source=", ".join(dict.fromkeys(filter(None, (camera.source, camera.pose_source)))),
+    )
+
+
+def _camera_problem(remark: str) -> Problem:
+    return Problem(code="camera.remark", severity="warning", text=remark)
 
 
 def _span(source: LogSource) -> tuple[int, int]:

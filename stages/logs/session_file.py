@@ -4,6 +4,10 @@ log: drive_07.mcap            # or a folder, or a list of bags; relative to this
 name: drive_07
 topics: {lidar: /ouster/points, imu: /imu/data, wheel: none}
 extrinsics: {lidar: [0.9, 0, 1.7, 0, 0, 0]}      # x, y, z (m), roll, pitch, yaw (rad), or 16 numbers
+calibration: calibration.json                    # cameras as `scanloom calibrate` writes them
+cameras:                                         # what the log and the calibration do not say of cameras
+  front: {topic: /cam_front/image_raw, model: kalibr.yaml, T_lidar_camera: [0.9, 0, -0.4, -1.57, 0, -1.57], clock_offset_s: 0.02}
+  rear: {topic: none}                            # left out
 truth: {file: truth.tum, poses_of: lidar}        # or just the file: TUM or KITTI poses
 settings: {odometry: {voxel_size_m: 0.4}}
 """
@@ -22,6 +26,7 @@ from scanloom.schemas.errors import InvalidInput, UsageError
 from scanloom.schemas.session import RawLog, TruthLog
 from scanloom.stages.logs.formats import detect
 from scanloom.stages.logs.locate import Located, check_file, locate
+from scanloom.stages.logs.session_cameras import CameraEntry, given_cameras
 
 _BESIDE_POSES = ("times.txt", "calib.txt")
 _MAX_BYTES = 1 << 20
@@ -64,6 +69,8 @@ class SessionFile(_Part):
     name: str = ""
     topics: Topics = Topics()
     extrinsics: Extrinsics = Extrinsics()
+    calibration: str = ""
+    cameras: dict[str, CameraEntry] = {}
     truth: str | TruthFile | None = None
     settings: dict[str, dict[str, Any]] = {}
 
@@ -81,7 +88,9 @@ def read_session_file(path: Path) -> Located:
     log = _log(session, folder, path)
     truth, truth_settings = _truth(session, folder, log)
     name = session.name or (folder.name if path.stem == "session" else path.stem)
-    return Located(name, log.format, log.raw_log, truth, _settings(session, log, truth_settings))
+    cameras = given_cameras(session.calibration, session.cameras, folder, path)
+    settings = _settings(session, log, {"truth": truth_settings, "images": cameras})
+    return Located(name, log.format, log.raw_log, truth, settings)
 
 
 def _parse(path: Path) -> SessionFile:
@@ -114,7 +123,9 @@ def _explained(error: ValidationError, path: Path) -> UsageError:
         return UsageError(
             f"{'.'.join(keys)}: {first['msg']}", where=str(path), next_step="correct the session file"
         )
-    parents: dict[str, type[BaseModel]] = {"topics": Topics, "extrinsics": Extrinsics, "truth": TruthFile}
+    parents: dict[str, type[BaseModel]] = {
+        "topics": Topics, "extrinsics": Extrinsics, "truth": TruthFile, "cameras": CameraEntry
+    }  # fmt: skip
     known = list((parents.get(keys[0], SessionFile) if len(keys) > 1 else SessionFile).model_fields)
     near = difflib.get_close_matches(keys[-1], known, 1, 0.4)
     hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
@@ -161,7 +172,9 @@ def _truth_settings(given: TruthFile) -> dict[str, Any]:
     return given.model_dump(exclude={"file"}, exclude_defaults=True)
 
 
-def _settings(session: SessionFile, log: Located, truth: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def _settings(
+    session: SessionFile, log: Located, others: dict[str, dict[str, Any]]
+) -> dict[str, dict[str, Any]]:
     ingest: dict[str, Any] = {
         f"{role}_topic": topic for role, topic in session.topics.model_dump().items() if topic
     }
@@ -169,7 +182,7 @@ def _settings(session: SessionFile, log: Located, truth: dict[str, Any]) -> dict
         if values is not None:
             ingest[f"{sensor}_on_base"] = list(values)
     merged = {stage: dict(values) for stage, values in log.settings.items()}
-    for extra in ({"ingest": ingest}, {"truth": truth}, session.settings):
+    for extra in ({"ingest": ingest}, others, session.settings):
         for stage, values in extra.items():
             if values:
                 merged.setdefault(stage, {}).update(values)
