@@ -57,9 +57,7 @@ def given_cameras(
     InvalidInput : a file is not there or describes no such camera.
     UsageError : a value makes no sense.
     """
-    rig = (
-        {entry.camera.name: entry for entry in read_camera_file(folder / calibration)} if calibration else {}
-    )
+    rig = _rig(folder / calibration) if calibration else {}
     given = []
     for name in dict.fromkeys((*rig, *cameras)):
         asked = cameras.get(name, CameraEntry())
