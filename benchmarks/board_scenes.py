@@ -11,7 +11,8 @@ from scanloom.schemas.cameras import CameraModel
 from scanloom.stages.calibrate.board import Board
 from scanloom.stages.calibrate.image import ImageBoard
 from scanloom.stages.calibrate.rays import Bearings, board_pose
-from scanloom.stages.calibrate.scene import LidarView, Placement, Scene
+from scanloom.stages.calibrate.scene import Placement, Scene
+from scanloom.stages.calibrate.view import LidarView, moved
 from scanloom.stages.geometry.camera import project
 from scanloom.stages.geometry.se3 import F8, inverse, pose, se3_exp, so3_exp, transform
 
@@ -28,6 +29,8 @@ class World:
     placements: int = 12
     range_sigma_m: float = 0.02
     corner_sigma_px: float = 0.2
+    range_offset_m: float = 0.005
+    """All ranges read too long by this, and each beam by as much again, one sigma."""
     beams: int = 32
     elevation_deg: tuple[float, float] = (-20.0, 15.0)
     azimuth_step_deg: float = 0.2
@@ -65,6 +68,7 @@ def simulate(world: World, seed: int) -> tuple[Scene, dict[str, F8]]:
     """A scene and the true poses of its cameras. Corners are numbered in either order, as an image leaves it open."""
     rng = np.random.default_rng(seed)
     models, poses = rig(world, rng)
+    offsets = world.range_offset_m * (rng.normal() + rng.normal(size=world.beams))
     placements: list[Placement] = []
     while len(placements) < world.placements:
         T_lidar_board = _stand(world, rng)
@@ -73,10 +77,10 @@ def simulate(world: World, seed: int) -> tuple[Scene, dict[str, F8]]:
             for camera, lens in models.items()
             if (seen := photograph(world, lens, poses[camera], T_lidar_board, rng)) is not None
         }
-        cloud = scan(world, T_lidar_board, rng)
+        cloud = scan(world, offsets, T_lidar_board, rng)
         if images and cloud is not None:
             placements.append(Placement(f"place{len(placements) + 1}", cloud, images))
-    return Scene(world.board, models, tuple(placements)), poses
+    return Scene.of(world.board, models, tuple(placements)), poses
 
 
 def _stand(world: World, rng: np.random.Generator) -> F8:
@@ -110,18 +114,18 @@ def photograph(
     return board.turned(world.board, int(rng.integers(world.board.ambiguity)))
 
 
-def scan(world: World, T_lidar_board: F8, rng: np.random.Generator) -> LidarView | None:
+def scan(world: World, offsets: F8, T_lidar_board: F8, rng: np.random.Generator) -> LidarView | None:
     """Points with range noise, and per ring the rays between the last on the board and the first beside it."""
     directions, row = _rays_towards(world, T_lidar_board)
     x, reach = _met(T_lidar_board, directions)
     low, high = world.board.outline_m()[0, :2], world.board.outline_m()[2, :2]
     on = ((x > low) & (x < high)).all(axis=1)
-    plane = directions[on] * (reach[on] + rng.normal(0, world.range_sigma_m, on.sum()))[:, None]
+    plane = directions[on] * (reach[on] + offsets[row[on]] + rng.normal(0, world.range_sigma_m, on.sum()))[:, None]
     changes = np.flatnonzero((on[1:] != on[:-1]) & (row[1:] == row[:-1]))
     if len(plane) < 50 or len(changes) < 8:
         return None
-    T, covariance = _fitted(world, T_lidar_board, plane, _Edges.between(world, x[changes], x[changes + 1], directions, changes))
-    return LidarView(T, covariance, len(plane), len(changes))
+    edges = _Edges.between(world, x[changes], x[changes + 1], directions, changes)
+    return _view(world, T_lidar_board, plane, row[on], edges)
 
 
 @dataclass(frozen=True)
@@ -145,8 +149,9 @@ class _Edges:
         return cls(directions[at] + directions[at + 1], normals, offsets, np.maximum(across / np.sqrt(12), 1e-3))
 
 
-def _fitted(world: World, T_start: F8, plane: F8, edges: _Edges) -> tuple[F8, F8]:
-    """Pose and covariance by least squares of ranges and edges, derivatives by differences."""
+def _view(world: World, T_start: F8, plane: F8, row: NDArray[np.int64], edges: _Edges) -> LidarView:
+    """The rows of ranges and edges at their best pose, derivatives by differences."""
+    beams, beam = np.unique(row, return_inverse=True)
 
     def rows(T: F8) -> F8:
         normal, middle = T[:3, 2], T[:3, 3]
@@ -156,13 +161,19 @@ def _fitted(world: World, T_start: F8, plane: F8, edges: _Edges) -> tuple[F8, F8
         off = ((edges.normals * x).sum(axis=1) - edges.offsets_m) / edges.sigma_m
         return np.concatenate(((reach - expected) / world.range_sigma_m, off))
 
-    T, H = T_start, np.eye(6)
-    for _ in range(5):
+    def slopes(T: F8) -> F8:
         steps = 1e-6 * np.eye(6)
-        J = np.stack([(rows(T @ se3_exp(s)) - rows(T @ se3_exp(-s))) / 2e-6 for s in steps], axis=1)
-        H = J.T @ J
-        T = T @ se3_exp(-np.linalg.solve(H, J.T @ rows(T)))
-    return T, np.asarray(np.linalg.inv(H))
+        return np.stack([(rows(moved(T, s)) - rows(moved(T, -s))) / 2e-6 for s in steps], axis=1)
+
+    T = T_start
+    for _ in range(5):
+        J = slopes(T)
+        T = moved(T, -np.linalg.solve(J.T @ J, J.T @ rows(T)))
+    by_sensor = np.zeros((len(plane) + len(edges.sigma_m), 2 + len(beams)))
+    by_sensor[np.arange(len(plane)), 2 + beam] = -1.0 / world.range_sigma_m
+    by_sensor[len(plane) :, 0] = -1.0 / edges.sigma_m
+    triangle = np.linalg.qr(np.column_stack((slopes(T), by_sensor, rows(T))), mode="r")
+    return LidarView.of(T, beams, triangle[:-1, :-1], triangle[:-1, -1], len(plane), len(edges.sigma_m))
 
 
 def _rays_towards(world: World, T_lidar_board: F8) -> tuple[F8, F8]:

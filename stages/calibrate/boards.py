@@ -14,7 +14,8 @@ import numpy as np
 from scanloom.stages.calibrate.factors import cloud_rows
 from scanloom.stages.calibrate.noise import Noise
 from scanloom.stages.calibrate.rays import Bearings
-from scanloom.stages.calibrate.scene import Scene
+from scanloom.stages.calibrate.scene import Placement, Scene
+from scanloom.stages.calibrate.view import Sensor, beam_gaps, rows_of
 from scanloom.stages.geometry.se3 import F8, adjoint, hat, inverse, se3_exp, transform
 
 _ROUNDS = 30
@@ -34,86 +35,78 @@ class Pair:
     T_lidar_board: F8
     T_camera_board: F8
     covariance: F8
-    """(6, 6) of their difference in the board's frame, without bias."""
+    """(6, 6) of their difference in the board's frame."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """All cameras by whole boards."""
+    """All cameras by whole boards, each for itself."""
 
     T_lidar_camera: dict[str, F8]
-    range_offset_m: float
-    covariance: F8
-    """(6 c + 1, 6 c + 1): tangents of the cameras in the order of their names, then the offset."""
+    covariance: dict[str, F8]
 
 
-def pairs_of(scene: Scene, noise: Noise) -> list[Pair]:
-    """All boards that a camera saw."""
+def pairs_of(scene: Scene, noise: Noise, sensor: Sensor | None = None) -> list[Pair]:
+    """All boards that a camera saw, with what is known of the LiDAR; nothing unless it is told."""
+    known = sensor or Sensor.unknown(scene.beams, noise)
+    bearings = scene.bearings()
     found = []
-    for (name, camera), bearings in scene.bearings().items():
-        p = next(p for p in scene.placements if p.name == name)
-        seen = p.images[camera]
-        sigma = max(seen.sigma_px, noise.corner_least_px)
-        image = _by_corners(bearings, scene.corners(p, camera), seen.T_camera_board, sigma)
-        T_lidar_board = p.cloud.T_lidar_board
-        found.append(Pair(name, camera, T_lidar_board, seen.T_camera_board, p.cloud.covariance + image))
+    for p in scene.placements:
+        T_lidar_board, cloud = rows_of(p.cloud, known, noise).board(known)
+        for camera, seen in p.images.items():
+            image = _by_corners(
+                bearings[p.name, camera], scene.corners(p, camera), seen.T_camera_board, seen.sigma_px, noise
+            )
+            found.append(Pair(p.name, camera, T_lidar_board, seen.T_camera_board, cloud + image))
     return found
 
 
-def _by_corners(bearings: Bearings, corners: F8, T_camera_board: F8, sigma_px: float) -> F8:
+def _by_corners(bearings: Bearings, corners: F8, T_camera_board: F8, sigma_px: float, noise: Noise) -> F8:
     """Covariance (6, 6) of the right tangent of a board by its corners (n, 3) in one image."""
     _, slopes = bearings.errors(transform(T_camera_board, corners))
     R = T_camera_board[:3, :3]
     turn, shift = -R @ hat(corners), np.broadcast_to(R, (len(corners), 3, 3))
-    J = (slopes @ np.concatenate((turn, shift), axis=2)).reshape(-1, 6) / sigma_px
+    J = (slopes @ np.concatenate((turn, shift), axis=2)).reshape(-1, 6) / max(sigma_px, noise.corner_least_px)
     return np.asarray(np.linalg.inv(J.T @ J))
 
 
-def misfit(pair: Pair, T_lidar_camera: F8, range_offset_m: float) -> F8:
+def misfit(pair: Pair, T_lidar_camera: F8) -> F8:
     """(6,) from the board by the cloud to that by the camera: turn, rad, and shift, m, in its frame."""
-    return cloud_rows(T_lidar_camera @ pair.T_camera_board, pair.T_lidar_board, range_offset_m)[0]
+    return cloud_rows(T_lidar_camera @ pair.T_camera_board, pair.T_lidar_board)[0]
 
 
-def agree(found: Sequence[Pair], start: Mapping[str, F8], noise: Noise) -> Agreement:
+def agree(found: Sequence[Pair], start: Mapping[str, F8]) -> Agreement:
     """Iterated weighted least squares; pairs far off hardly count (Geman and McClure), less and less as it goes on."""
-    cameras = sorted({pair.camera for pair in found})
-    poses, far = {c: start[c] for c in cameras}, 0.0
-    weights = [np.linalg.inv(pair.covariance + noise.bias_covariance) for pair in found]
-    H = np.eye(6 * len(cameras) + 1)
+    poses, covariance = {}, {}
+    for camera in sorted({pair.camera for pair in found}):
+        mine = [pair for pair in found if pair.camera == camera]
+        poses[camera], covariance[camera] = _agree(mine, start[camera])
+    return Agreement(poses, covariance)
+
+
+def _agree(found: Sequence[Pair], T: F8) -> tuple[F8, F8]:
+    weights = [np.linalg.inv(pair.covariance) for pair in found]
+    H = np.eye(6)
     for strictness in _STRICTER:
+        limit = (strictness * _ROBUST_SIGMAS) ** 2
         for _ in range(_ROUNDS):
-            H, g = _normal(found, weights, poses, far, noise, (strictness * _ROBUST_SIGMAS) ** 2)
+            H, g = np.zeros((6, 6)), np.zeros(6)
+            for pair, W in zip(found, weights):
+                error, J = _slopes(pair, T)
+                trust = (limit / (limit + error @ W @ error / 6)) ** 2
+                H += trust * J.T @ W @ J
+                g += trust * J.T @ W @ error
             step = -np.linalg.solve(H, g)
-            for i, camera in enumerate(cameras):
-                poses[camera] = poses[camera] @ se3_exp(step[6 * i : 6 * i + 6])
-            far += float(step[-1])
+            T = T @ se3_exp(step)
             if np.abs(step).max() < _SMALL:
                 break
-    return Agreement(poses, far, np.asarray(np.linalg.inv(H)))
+    return T, np.asarray(np.linalg.inv(H))
 
 
-def _normal(
-    found: Sequence[Pair], weights: Sequence[F8], poses: Mapping[str, F8], far: float, noise: Noise, limit: float
-) -> tuple[F8, F8]:
-    """Equations of one step; `limit` is the square beyond which a pair loses its weight."""
-    cameras = sorted(poses)
-    size = 6 * len(cameras) + 1
-    H, g = np.zeros((size, size)), np.zeros(size)
-    H[-1, -1], g[-1] = 1 / noise.range_prior_m**2, far / noise.range_prior_m**2
-    for pair, W in zip(found, weights):
-        at = 6 * cameras.index(pair.camera)
-        error, J = _slopes(pair, poses[pair.camera], far)
-        trust = (limit / (limit + error @ W @ error / 6)) ** 2
-        columns = np.r_[at : at + 6, size - 1]
-        H[np.ix_(columns, columns)] += trust * J.T @ W @ J
-        g[columns] += trust * J.T @ W @ error
-    return H, g
-
-
-def _slopes(pair: Pair, T_lidar_camera: F8, far: float) -> tuple[F8, F8]:
-    """Misfit (6,) and its derivative (6, 7) by the camera's tangent and the offset."""
-    error, by_board, by_far = cloud_rows(T_lidar_camera @ pair.T_camera_board, pair.T_lidar_board, far)
-    return error, np.concatenate((by_board @ adjoint(inverse(pair.T_camera_board)), by_far), axis=1)
+def _slopes(pair: Pair, T_lidar_camera: F8) -> tuple[F8, F8]:
+    """Misfit (6,) and its derivative (6, 6) by the camera's tangent."""
+    error, by_board = cloud_rows(T_lidar_camera @ pair.T_camera_board, pair.T_lidar_board)
+    return error, by_board @ adjoint(inverse(pair.T_camera_board))
 
 
 @dataclass(frozen=True)
@@ -126,53 +119,72 @@ class Stranger:
     """Chi-square over its freedom, in units of what the others have."""
 
 
-def strangers(found: Sequence[Pair], start: Mapping[str, F8], noise: Noise, limit: float) -> list[Stranger]:
-    """Pairs that do not fit, worst first, each judged by a calibration without its placement.
+def strangers(found: Sequence[Pair], start: Mapping[str, F8], limit: float) -> list[Stranger]:
+    """Pairs that do not fit, worst first, each judged by a calibration of its camera without it.
 
     In units of what the others scatter by (their median). A camera keeps three pairs at least.
     """
     kept, out = list(found), []
     while True:
-        judged = _judged(kept, start, noise)
+        judged = [s for i in range(len(kept)) if (s := _judged(kept, i, start)) is not None]
         if not judged:
             return out
         usual = max(1.0, float(np.median([s.square for s in judged])) / _MEDIAN)
-        open_to_doubt = [s for s in judged if sum(p.camera == s.pair.camera for p in kept) > 3]
-        worst = max(open_to_doubt, key=lambda s: s.square, default=None)
-        if worst is None or worst.square / usual < limit:
+        worst = max(judged, key=lambda s: s.square)
+        if worst.square / usual < limit:
             return out
         out.append(Stranger(worst.pair, worst.misfit, worst.square / usual))
         kept.remove(worst.pair)
 
 
-def _judged(kept: Sequence[Pair], start: Mapping[str, F8], noise: Noise) -> list[Stranger]:
-    found = []
-    for name in sorted({pair.placement for pair in kept}):
-        others = [pair for pair in kept if pair.placement != name]
-        known = agree(others, start, noise) if others else None
-        for pair in kept:
-            if pair.placement == name and known and pair.camera in known.T_lidar_camera:
-                found.append(_against(pair, known, noise))
-    return found
-
-
-def _against(pair: Pair, known: Agreement, noise: Noise) -> Stranger:
-    error, J = _slopes(pair, known.T_lidar_camera[pair.camera], known.range_offset_m)
-    at = 6 * sorted(known.T_lidar_camera).index(pair.camera)
-    columns = np.r_[at : at + 6, len(known.covariance) - 1]
-    S = pair.covariance + noise.bias_covariance + J @ known.covariance[np.ix_(columns, columns)] @ J.T
+def _judged(kept: Sequence[Pair], i: int, start: Mapping[str, F8]) -> Stranger | None:
+    pair = kept[i]
+    others = [other for j, other in enumerate(kept) if j != i and other.camera == pair.camera]
+    if len(others) < 3:
+        return None
+    T, covariance = _agree(others, start[pair.camera])
+    error, J = _slopes(pair, T)
+    S = pair.covariance + J @ covariance @ J.T
     return Stranger(pair, error, float(error @ np.linalg.solve(S, error) / 6))
 
 
-def scattered(found: Sequence[Pair], known: Agreement, noise: Noise) -> Noise:
-    """The noise with the bias of whole boards that their misfits ask for.
+def scattered(scene: Scene, noise: Noise, poses: Mapping[str, F8], sensor: Sensor) -> Noise:
+    """The noise with the errors of whole boards, and of beams within a placement, that their misfits ask for.
 
     In each of four directions (tilt, turn, on the plane, along the normal): the mean square of the misfits, freedom
-    counted, less what the noise of points and corners explains.
+    counted, less what the noise of points, beams and corners explains.
     """
-    errors = np.array([misfit(p, known.T_lidar_camera[p.camera], known.range_offset_m) for p in found])
+    beam_m = _beam_scatter(scene, poses, sensor)
+    plain = noise.with_bias((0.0, 0.0, 0.0, 0.0), beam_m)
+    found = pairs_of(scene, plain, sensor)
+    errors = np.array([misfit(p, poses[p.camera]) for p in found])
     formal = np.array([np.diag(pair.covariance) for pair in found])
-    freedom = max(1.0 - len(known.T_lidar_camera) / len(found), 0.25)
+    freedom = max(1.0 - len(poses) / len(found), 0.25)
     excess = np.maximum(np.mean(errors**2, axis=0) / freedom - np.mean(formal, axis=0), 0.0)
-    tilt, spin, plane, normal = excess[:2].mean(), excess[2], excess[3:5].mean(), excess[5]
-    return noise.with_bias(*(float(np.sqrt(value)) for value in (tilt, spin, plane, normal)))
+    tilt, spin, plane, normal = np.sqrt((excess[:2].mean(), excess[2], excess[3:5].mean(), excess[5]))
+    return noise.with_bias((float(tilt), float(spin), float(plane), float(normal)), beam_m)
+
+
+def _beam_scatter(scene: Scene, poses: Mapping[str, F8], sensor: Sensor) -> float:
+    """How much offsets of beams differ between placements, m, the mean of each placement apart."""
+    squares, formal = [], []
+    for p in scene.placements:
+        gaps, variance = beam_gaps(p.cloud, _board(p, poses), sensor)
+        if len(gaps) > 2:
+            squares.append((gaps - gaps.mean()) ** 2 * len(gaps) / (len(gaps) - 1))
+            formal.append(variance)
+    if not squares:
+        return 0.0
+    all_squares = np.concatenate(squares)
+    limited = np.minimum(all_squares, _FAR_SQUARE * np.median(all_squares))
+    return float(np.sqrt(max(np.mean(limited) - np.mean(np.concatenate(formal)), 0.0)))
+
+
+_FAR_SQUARE = 20.0
+"""Times the median: three standard deviations."""
+
+
+def _board(p: Placement, poses: Mapping[str, F8]) -> F8:
+    """The board by the image that scatters least."""
+    camera = min(p.images, key=lambda c: p.images[c].sigma_px)
+    return poses[camera] @ p.images[camera].T_camera_board

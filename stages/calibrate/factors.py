@@ -23,27 +23,24 @@ def corner_rows(T_lidar_camera: F8, T_lidar_board: F8, corners: F8, bearings: Be
     return error, by_camera, by_board
 
 
-def cloud_rows(T_lidar_board: F8, T_cloud: F8, far_m: float) -> tuple[F8, F8, F8]:
-    """From the board by the cloud to the true one, as the LiDAR would see it: (6,) turn and shift in its frame.
-
-    The LiDAR reads every range too long by `far_m`; derivatives (6, 6) by the board and (6, 1) by that.
-    """
+def cloud_rows(T_lidar_board: F8, T_cloud: F8) -> tuple[F8, F8]:
+    """From the board by the cloud to another: (6,) turn, rad, and shift, m, in its frame; derivatives (6, 6)."""
     Rt = T_cloud[:3, :3].T
-    away = T_cloud[:3, 3] / np.linalg.norm(T_cloud[:3, 3])
     turn = so3_log(Rt @ T_lidar_board[:3, :3])
-    shift = Rt @ (T_lidar_board[:3, 3] + far_m * away - T_cloud[:3, 3])
+    shift = Rt @ (T_lidar_board[:3, 3] - T_cloud[:3, 3])
     by_board = np.zeros((6, 6))
     by_board[:3, :3] = _right_jacobian_inverse(turn)
     by_board[3:, 3:] = Rt @ T_lidar_board[:3, :3]
-    by_far = np.concatenate((np.zeros(3), Rt @ away))[:, None]
-    return np.concatenate((turn, shift)), by_board, by_far
+    return np.concatenate((turn, shift)), by_board
 
 
 def _right_jacobian_inverse(w: F8) -> F8:
     """d so3_log(R exp(v)) / dv at v = 0 (Sola et al. 2018, eq. 144)."""
     angle = float(np.linalg.norm(w))
     K = hat(w)
-    bend = 1.0 / 12.0 if angle < 1e-4 else 1.0 / angle**2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))
+    bend = (
+        1.0 / 12.0 if angle < 1e-4 else 1.0 / angle**2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))
+    )
     return np.asarray(np.eye(3) + 0.5 * K + bend * K @ K)
 
 

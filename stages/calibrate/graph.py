@@ -1,27 +1,28 @@
-"""The graph: a pose per camera, a board per placement, one offset of the ranges; tied by corners and clouds, by GTSAM.
+"""The graph: a pose per camera, a board per placement, the errors of the LiDAR; tied by corners and clouds, by GTSAM.
 
-The rows of each cloud (ranges along their rays, edges, squares) were solved before and enter as one factor with their
-covariance. Custom factors in Python cost a call each, so that each holds all corners of one image: a graph of 14
+The rows of each cloud (ranges along their rays, edges, squares) enter as one factor, triangular and so as small as it
+can be. Custom factors in Python cost a call each, so that each holds all corners of one image: a graph of 14
 placements has some thirty factors and is solved in a tenth of a second.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from scanloom.schemas.cameras import CameraModel
-from scanloom.stages.calibrate.factors import cloud_rows, corner_rows, softened
+from scanloom.stages.calibrate.factors import corner_rows, softened
 from scanloom.stages.calibrate.noise import Noise
 from scanloom.stages.calibrate.rays import Bearings
 from scanloom.stages.calibrate.scene import Placement, Scene
+from scanloom.stages.calibrate.view import Rows, Sensor, rows_of
 from scanloom.stages.geometry.se3 import F8
 
-Rows = Callable[..., tuple[F8, list[F8]]]
-CAMERA, BOARD, RANGE, LENS = "c", "b", "o", "k"
+Residual = Callable[..., tuple[F8, list[F8]]]
+CAMERA, BOARD, SENSOR, LENS = "c", "b", "s", "k"
 
 
 @dataclass(frozen=True)
@@ -31,27 +32,24 @@ class Estimate:
     T_lidar_camera: dict[str, F8]
     T_lidar_board: dict[str, F8]
     """By corners and cloud together, where the boards truly stand."""
-    range_offset_m: float
-    """How much too long the LiDAR reads."""
-    range_offset_sigma_m: float
+    sensor: Sensor
+    """What the LiDAR is off by."""
     models: dict[str, CameraModel]
     """As given, or corrected where intrinsics were free."""
     covariance: F8
     """Of the right tangents of all cameras together, in the order of their names: (6 c, 6 c); scaled."""
     scale: float
     """What the misfit of the clouds put on the standard deviations, 1 at least."""
-    misfit: dict[str, F8]
-    """By placement: (6,) from the board by the cloud to where it stands, in units of their noise."""
+    rows: dict[str, Rows]
+    """By placement: what its cloud says, as the graph has it."""
 
     def camera_covariance(self, camera: str) -> F8:
         i = sorted(self.T_lidar_camera).index(camera)
         return self.covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
 
-    def seen_board(self, T_cloud: F8) -> F8:
-        """Where a board truly stands that the LiDAR sees at `T_cloud`."""
-        T = T_cloud.copy()
-        T[:3, 3] *= 1.0 - self.range_offset_m / np.linalg.norm(T_cloud[:3, 3])
-        return T
+    def board_by_cloud(self, p: Placement, noise: Noise) -> F8:
+        """Where the LiDAR alone has a board, corrected by what it is off."""
+        return rows_of(p.cloud, self.sensor, noise).board(self.sensor)[0]
 
 
 def solve(scene: Scene, start: Mapping[str, F8], noise: Noise) -> Estimate:
@@ -64,11 +62,13 @@ def solve(scene: Scene, start: Mapping[str, F8], noise: Noise) -> Estimate:
     import gtsam
 
     graph, values, key = gtsam.NonlinearFactorGraph(), gtsam.Values(), _Keys(scene)
-    _add_sensors(graph, values, key, scene, start, noise)
+    sensor = Sensor.unknown(scene.beams, noise)
+    rows = {p.name: rows_of(p.cloud, sensor, noise) for p in scene.placements}
+    _add_sensors(graph, values, key, scene, start, sensor, noise)
     bearings = scene.bearings()
     for p in scene.placements:
         values.insert(key.board(p.name), gtsam.Pose3(p.cloud.T_lidar_board))
-        graph.add(_cloud_factor(key, p, noise))
+        graph.add(_cloud_factor(key, p.name, rows[p.name]))
         for camera in p.images:
             graph.add(_corner_factor(key, scene, p, camera, bearings[p.name, camera], noise))
     parameters = gtsam.LevenbergMarquardtParams()
@@ -76,7 +76,7 @@ def solve(scene: Scene, start: Mapping[str, F8], noise: Noise) -> Estimate:
     parameters.setRelativeErrorTol(1e-9)
     parameters.setAbsoluteErrorTol(1e-9)
     solved = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-    return _estimate(graph, solved, key, scene, noise)
+    return _estimate(graph, solved, key, scene, rows, noise)
 
 
 class _Keys:
@@ -85,7 +85,7 @@ class _Keys:
     def __init__(self, scene: Scene) -> None:
         self._cameras = {name: i for i, name in enumerate(scene.cameras)}
         self._placements = {name: i for i, name in enumerate(scene.names)}
-        self.range = _symbol(RANGE, 0)
+        self.sensor = _symbol(SENSOR, 0)
 
     def camera(self, name: str) -> int:
         return _symbol(CAMERA, self._cameras[name])
@@ -104,37 +104,29 @@ def _symbol(letter: str, number: int) -> int:
 
 
 def _add_sensors(
-    graph: Any, values: Any, key: _Keys, scene: Scene, start: Mapping[str, F8], noise: Noise
+    graph: Any, values: Any, key: _Keys, scene: Scene, start: Mapping[str, F8], sensor: Sensor, noise: Noise
 ) -> None:
-    """Cameras, their lenses where these are free, and the LiDAR's offset."""
+    """Cameras, their lenses where these are free, and what the LiDAR is off by."""
     import gtsam
 
-    def vector(number: int, sigma: F8) -> None:
-        values.insert(number, np.zeros(len(sigma)))
-        prior = gtsam.noiseModel.Diagonal.Sigmas(sigma)
-        graph.add(gtsam.PriorFactorVector(number, np.zeros(len(sigma)), prior))
+    def vector(number: int, covariance: F8) -> None:
+        zero = np.zeros(len(covariance))
+        values.insert(number, zero)
+        graph.add(gtsam.PriorFactorVector(number, zero, gtsam.noiseModel.Gaussian.Covariance(covariance)))
 
-    vector(key.range, np.array([noise.range_prior_m]))
+    vector(key.sensor, sensor.covariance)
     for camera in scene.cameras:
         values.insert(key.camera(camera), gtsam.Pose3(start[camera]))
         if noise.lens_share > 0:
-            vector(key.lens(camera), np.full(4, noise.lens_share * scene.models[camera].fx_px))
+            vector(key.lens(camera), np.eye(4) * (noise.lens_share * scene.models[camera].fx_px) ** 2)
 
 
-def _cloud_factor(key: _Keys, p: Placement, noise: Noise) -> Any:
-    whiten = whitener(p, noise)
+def _cloud_factor(key: _Keys, name: str, cloud: Rows) -> Any:
+    def rows(T_lidar_board: F8, sensor: F8) -> tuple[F8, list[F8]]:
+        error, slopes = cloud.at(T_lidar_board, sensor)
+        return error, [slopes, cloud.by_sensor]
 
-    def rows(T_lidar_board: F8, far: F8) -> tuple[F8, list[F8]]:
-        error, by_board, by_far = cloud_rows(T_lidar_board, p.cloud.T_lidar_board, float(far[0]))
-        return whiten @ error, [whiten @ by_board, whiten @ by_far]
-
-    return _factor([key.board(p.name), key.range], 6, rows)
-
-
-def whitener(p: Placement, noise: Noise) -> F8:
-    """(6, 6) that makes the misfit of a cloud's board a vector of unit variances."""
-    covariance = p.cloud.covariance + noise.bias_covariance
-    return np.asarray(np.linalg.cholesky(np.linalg.inv(covariance)).T)
+    return _factor([key.board(name), key.sensor], len(cloud.gap), rows)
 
 
 def _corner_factor(key: _Keys, scene: Scene, p: Placement, camera: str, seen: Bearings, noise: Noise) -> Any:
@@ -157,14 +149,16 @@ def _corner_factor(key: _Keys, scene: Scene, p: Placement, camera: str, seen: Be
     return _factor(keys, 2 * len(corners), rows)
 
 
-def _factor(keys: list[int], size: int, rows: Rows) -> Any:
+def _factor(keys: list[int], size: int, rows: Residual) -> Any:
     """A factor of GTSAM whose rows are already in units of their noise."""
     import gtsam
 
-    vectors = [chr(gtsam.symbolChr(k)) in (LENS, RANGE) for k in keys]
+    vectors = [chr(gtsam.symbolChr(k)) in (LENS, SENSOR) for k in keys]
 
     def error(this: Any, values: Any, jacobians: list[F8] | None) -> F8:
-        states = [values.atVector(k) if v else values.atPose3(k).matrix() for k, v in zip(this.keys(), vectors)]
+        states = [
+            values.atVector(k) if v else values.atPose3(k).matrix() for k, v in zip(this.keys(), vectors)
+        ]
         e, slopes = rows(*states)
         if jacobians is not None:
             for i, J in enumerate(slopes):
@@ -174,34 +168,29 @@ def _factor(keys: list[int], size: int, rows: Rows) -> Any:
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(size), keys, error)
 
 
-def _estimate(graph: Any, solved: Any, key: _Keys, scene: Scene, noise: Noise) -> Estimate:
+def _estimate(
+    graph: Any, solved: Any, key: _Keys, scene: Scene, rows: dict[str, Rows], noise: Noise
+) -> Estimate:
     import gtsam
 
     cameras = {c: np.asarray(solved.atPose3(key.camera(c)).matrix()) for c in scene.cameras}
     boards = {name: np.asarray(solved.atPose3(key.board(name)).matrix()) for name in scene.names}
-    far = float(solved.atVector(key.range)[0])
     marginals = gtsam.Marginals(graph, solved)
     keys = gtsam.KeyVector([key.camera(c) for c in scene.cameras])
     covariance = np.asarray(marginals.jointMarginalCovariance(keys).fullMatrix())
-    misfit = {
-        p.name: whitener(p, noise) @ cloud_rows(boards[p.name], p.cloud.T_lidar_board, far)[0]
-        for p in scene.placements
-    }
-    freedom = max(6 * len(misfit) - 6 * len(cameras) - 1, len(misfit))
-    scale = max(1.0, float(np.sqrt(sum(e @ e for e in misfit.values()) / freedom)))
+    mean = np.asarray(solved.atVector(key.sensor))
+    sensor = Sensor(scene.beams, mean, np.asarray(marginals.marginalCovariance(key.sensor)))
+    scale = _scale([rows[name].at(T, mean)[0] for name, T in boards.items()], len(cameras))
     models = dict(scene.models)
     if noise.lens_share > 0:
         models = {c: corrected(m, solved.atVector(key.lens(c))) for c, m in models.items()}
-    return Estimate(
-        T_lidar_camera=cameras,
-        T_lidar_board=boards,
-        range_offset_m=far,
-        range_offset_sigma_m=float(np.sqrt(marginals.marginalCovariance(key.range)[0, 0])) * scale,
-        models=models,
-        covariance=covariance * scale**2,
-        scale=scale,
-        misfit=misfit,
-    )
+    return Estimate(cameras, boards, sensor, models, covariance * scale**2, scale, rows)
+
+
+def _scale(errors: Sequence[F8], cameras: int) -> float:
+    """By how much the clouds miss the boards, in units of their noise; boards that the images hold take no freedom."""
+    freedom = sum(len(e) for e in errors) - 6 * cameras
+    return max(1.0, float(np.sqrt(sum(e @ e for e in errors) / max(freedom, 6))))
 
 
 def corrected(model: CameraModel, shift: F8) -> CameraModel:

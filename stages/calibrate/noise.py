@@ -18,8 +18,19 @@ class Noise:
     bias: tuple[float, float, float, float] = (1e-3, 1e-3, 5e-4, 5e-4)
     """What a whole board is off in the cloud beyond the noise of its points: tilt and turn about the normal, rad, on its
     plane and along its normal, m."""
+    beam_m: float = 0.003
+    """By how much a beam's offset changes from placement to placement."""
+    apart_m: float = 0.01
+    """By how much all boards may stand nearer by the clouds than by the images: ranges that are all too short, a focal
+    length or a lens that is a little off, a print that is not quite to scale."""
     range_offset_m: float = 0.01
-    """By how much the LiDAR may read all ranges too long; 0 believes them as they are."""
+    """By how much the LiDAR may read all ranges too long, as its own view of the squares tells."""
+    beam_offset_m: float = 0.01
+    """By how much each beam may differ from that."""
+    larger_m: float = 0.008
+    """By how much a board may look larger on each side: beams have a width."""
+    darker_m: float = 0.015
+    """By how much farther dark print may read than bright print."""
     softness: float = 3.0
     """Corners beyond so many standard deviations count linearly (Huber)."""
     lens_share: float = 0.0
@@ -31,19 +42,11 @@ class Noise:
         tilt, spin, plane, normal = self.bias
         return np.array([tilt, tilt, spin, plane, plane, normal])
 
-    @property
-    def bias_covariance(self) -> F8:
-        return np.diag(self.bias_sigmas**2)
+    def with_bias(self, bias: tuple[float, float, float, float], beam_m: float) -> Noise:
+        """With the larger of these and the least ones of the defaults."""
+        least = Noise()
+        tilt, spin, plane, normal = (max(value, floor) for value, floor in zip(bias, least.bias))
+        return replace(self, bias=(tilt, spin, plane, normal), beam_m=max(beam_m, _LEAST_BEAM_M))
 
-    @property
-    def range_prior_m(self) -> float:
-        """Never quite zero, so that the variable can stay in the graph."""
-        return max(self.range_offset_m, 1e-6)
 
-    def with_bias(self, tilt: float, spin: float, plane: float, normal: float) -> Noise:
-        """With the larger of this and the least bias."""
-        least = self.bias
-        return replace(
-            self,
-            bias=(max(tilt, least[0]), max(spin, least[1]), max(plane, least[2]), max(normal, least[3])),
-        )
+_LEAST_BEAM_M = 5e-4

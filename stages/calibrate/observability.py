@@ -15,7 +15,11 @@ from scanloom.stages.geometry.se3 import F8, adjoint, inverse, pose, so3_exp, tr
 
 _REACH_M = 5.0
 """A turn counts as much as the shift it makes at this distance."""
-_TURNS = ("pitch (about the camera's right axis)", "yaw (about its down axis)", "roll (about its viewing axis)")
+_TURNS = (
+    "pitch (about the camera's right axis)",
+    "yaw (about its down axis)",
+    "roll (about its viewing axis)",
+)
 _SHIFTS = ("right or left", "down or up", "forward or back")
 _TILTS_DEG = (0.0, 40.0)
 
@@ -87,7 +91,7 @@ def _imagined(camera: CameraModel, board: Board, near: float) -> list[tuple[F8, 
             for away in (near, 2 * near):
                 for turn, how in _orientations():
                     T = pose(_towards(direction) @ turn, away * direction)
-                    pixels, seen = project(camera, transform(T, board.outline_m()))
+                    _pixels, seen = project(camera, transform(T, board.outline_m()))
                     if seen.all():
                         place = "the middle" if row == column == "middle" else f"the {row} {column}"
                         found.append((T, f"a board {away:.1f} m away in {place} of the image, {how}"))

@@ -122,7 +122,9 @@ def refined(bearings: Bearings, points: F8, T_camera_points: F8) -> Fit:
 
 def _normal(bearings: Bearings, points: F8, T: F8) -> tuple[float, F8, F8]:
     error, slopes = bearings.errors(transform(T, points))
-    J = slopes @ np.concatenate((-T[:3, :3] @ hat(points), np.broadcast_to(T[:3, :3], (len(points), 3, 3))), 2)
+    J = slopes @ np.concatenate(
+        (-T[:3, :3] @ hat(points), np.broadcast_to(T[:3, :3], (len(points), 3, 3))), 2
+    )
     J, e = J.reshape(-1, 6), error.ravel()
     return float(e @ e), J.T @ J, J.T @ e
 

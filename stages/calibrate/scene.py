@@ -9,18 +9,8 @@ from scanloom.schemas.cameras import CameraModel
 from scanloom.stages.calibrate.board import Board
 from scanloom.stages.calibrate.image import ImageBoard
 from scanloom.stages.calibrate.rays import Bearings
+from scanloom.stages.calibrate.view import I8, LidarView, all_beams
 from scanloom.stages.geometry.se3 import F8
-
-
-@dataclass(frozen=True)
-class LidarView:
-    """The board in one cloud: all ranges, edges and squares of it, condensed into a pose and how sure it is."""
-
-    T_lidar_board: F8
-    covariance: F8
-    """(6, 6) of the right tangent (rotation, translation)."""
-    points: int = 0
-    edge_points: int = 0
 
 
 @dataclass(frozen=True)
@@ -34,7 +24,9 @@ class Placement:
     def without(self, cameras: Iterable[str]) -> Placement:
         """The same without the images of these cameras."""
         left_out = set(cameras)
-        return replace(self, images={name: seen for name, seen in self.images.items() if name not in left_out})
+        return replace(
+            self, images={name: seen for name, seen in self.images.items() if name not in left_out}
+        )
 
 
 @dataclass(frozen=True)
@@ -44,6 +36,15 @@ class Scene:
     board: Board
     models: Mapping[str, CameraModel]
     placements: tuple[Placement, ...]
+    beams: I8
+    """Names of the LiDAR's beams on any board, sorted; a part of a scene keeps those of all of it."""
+
+    @classmethod
+    def of(
+        cls, board: Board, models: Mapping[str, CameraModel], placements: tuple[Placement, ...]
+    ) -> Scene:
+        """A scene of all there is."""
+        return cls(board, models, placements, all_beams([p.cloud for p in placements]))
 
     def only(self, names: Iterable[str]) -> Scene:
         """Some of the placements, and the cameras that still see one."""
@@ -58,7 +59,7 @@ class Scene:
 
     def _of(self, placements: tuple[Placement, ...]) -> Scene:
         seen = {camera for p in placements for camera in p.images}
-        return Scene(self.board, {c: m for c, m in self.models.items() if c in seen}, placements)
+        return Scene(self.board, {c: m for c, m in self.models.items() if c in seen}, placements, self.beams)
 
     def bearings(self) -> dict[tuple[str, str], Bearings]:
         """Corners as directions, by placement and camera."""

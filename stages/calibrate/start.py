@@ -43,10 +43,12 @@ def start(scene: Scene, given: Mapping[str, F8] | None = None) -> Start:
         rough = told if told is not None else _consensus(scene, camera)
         for p in scene.placements:
             if camera in p.images:
-                ordered[p.name][camera] = _fitting(scene, p, p.images[camera], rough, by_turn=told is not None)
+                ordered[p.name][camera] = _fitting(
+                    scene, p, p.images[camera], rough, by_turn=told is not None
+                )
         here = replace(scene, placements=_reordered(scene, ordered))
         near = _agreeing(here, camera, rough)
-        poses[camera] = rough if told is not None else _epnp(here, camera, near, rough)
+        poses[camera] = rough if told is not None else epnp(here, camera, near, rough)
         agreeing[camera] = near
     return Start(replace(scene, placements=_reordered(scene, ordered)), poses, agreeing)
 
@@ -86,7 +88,9 @@ def _misfit(T_lidar_camera: F8, T_lidar_board: F8, seen: ImageBoard, corners: F8
     return float(min(found)), int(np.argmin(found))
 
 
-def _fitting(scene: Scene, p: Placement, seen: ImageBoard, T_lidar_camera: F8, *, by_turn: bool) -> ImageBoard:
+def _fitting(
+    scene: Scene, p: Placement, seen: ImageBoard, T_lidar_camera: F8, *, by_turn: bool
+) -> ImageBoard:
     """The corners in the order that fits a camera; by directions alone where its pose may be half a metre off."""
     corners = scene.board.outline_m()
     if not by_turn:
@@ -102,11 +106,12 @@ def _agreeing(scene: Scene, camera: str, T_lidar_camera: F8) -> tuple[str, ...]:
         p.name
         for p in scene.placements
         if camera in p.images
-        and _misfit(T_lidar_camera, p.cloud.T_lidar_board, replace(p.images[camera], turns=1), outline)[0] < _AGREE
+        and _misfit(T_lidar_camera, p.cloud.T_lidar_board, replace(p.images[camera], turns=1), outline)[0]
+        < _AGREE
     )
 
 
-def _epnp(scene: Scene, camera: str, names: tuple[str, ...], otherwise: F8) -> F8:
+def epnp(scene: Scene, camera: str, names: tuple[str, ...], otherwise: F8) -> F8:
     """EPnP (Lepetit, Moreno-Noguer, Fua 2009) in RANSAC over all pairs, on a plane across the middle of them."""
     import cv2
 
