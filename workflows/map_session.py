@@ -68,6 +68,6 @@ NODES: tuple[Node, ...] = (
     node("overview",   overview,   per="map",     reads=(Tile, RemovedTile),                   writes=(TileIndex, Overview, MapFiles)),
     node("evaluation", evaluation, per="map",     reads=(Session, Truth, Odometry, Poses, Loops, Graph, Gnss, Tile, SensorCheck, ClassCounts, RemovedTile), writes=(Metrics, ErrorTrack)),
     node("picture",    picture,    per="map",     reads=(Poses, Loops, Graph, TileIndex, Tile, RemovedTile), writes=PictureFiles),
-    node("report",     report,     per="map",     reads=(Session, Metrics, ErrorTrack, Odometry, Poses, Loops, Graph, TileIndex, PictureFiles, SensorCheck, Changes, ObjectTracks, ClassCounts), writes=ReportFiles),
+    node("report",     report,     per="map",     reads=(Session, Metrics, ErrorTrack, Odometry, Poses, Loops, Graph, TileIndex, PictureFiles, SensorCheck, Changes, ObjectTracks, ClassCounts, Cameras), writes=ReportFiles),
 )
 # fmt: on

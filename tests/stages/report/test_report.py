@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from scanloom.schemas.cameras import Camera, CameraModel, Cameras, Footage
 from scanloom.schemas.evaluation import ErrorTrack, Metrics, ReportFiles
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.pose_graph import Graph
@@ -270,6 +271,31 @@ def test_what_the_scans_said_of_the_sensors_is_told_and_escaped(street_map: Map)
     assert "Wheels: &lt;no&gt; known unit." in page
     assert '<span class="pill warning">sensors</span>' in page
     assert "sensors</span>" not in body(street_map.report())
+
+
+def test_cameras_are_listed(street_map: Map) -> None:
+    model = CameraModel(
+        lens="equidistant",
+        width_px=1920,
+        height_px=1208,
+        fx_px=9,
+        fy_px=9,
+        cx_px=9,
+        cy_px=9,
+        distortion=(0, 0, 0, 0),
+    )
+    seen = Cameras(
+        cameras=(Camera(name="cam_front", model=model, source="camera info"),),
+        footage=(Footage(camera="cam_front", topic="/cam_front/image_raw", images=1200, kept=240),),
+        remarks=("Camera <rear> cannot be used.",),
+    )
+    page = body(street_map.report(cameras=one(seen)))
+    assert "Camera &lt;rear&gt; cannot be used." in page
+    assert all(
+        text in page for text in ("cam_front", "1920 x 1208", "equidistant", "240", '"pill warning">unknown')
+    )
+    bare = body(street_map.report(cameras=one(Cameras())))
+    assert bare == body(street_map.report())
 
 
 def test_what_the_graph_warns_of_lowers_the_verdict_and_what_it_remarks_does_not(street_map: Map) -> None:
