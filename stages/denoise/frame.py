@@ -107,16 +107,3 @@ def places_from(x: F4, y: F4, z: F4, T: F4, row_start: I4, columns: int) -> tupl
     for n in range(len(x)):
         column[n] += row_start[row[n]]
     return column, away
-
-
-@kernel
-def taken(x: F4, y: F4, z: F4, rows: I8) -> tuple[F4, F4, F4]:
-    """Coordinates of the points `rows` (m,)."""
-    a, b, c = (
-        np.empty(len(rows), np.float32),
-        np.empty(len(rows), np.float32),
-        np.empty(len(rows), np.float32),
-    )
-    for m in range(len(rows)):
-        a[m], b[m], c[m] = x[rows[m]], y[rows[m]], z[rows[m]]
-    return a, b, c

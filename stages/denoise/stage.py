@@ -16,7 +16,8 @@ from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
 from scanloom.schemas.session import Session
 from scanloom.schemas.tracks import Imu, Wheel
-from scanloom.stages.denoise.airborne import airborne, met_again
+from scanloom.stages.denoise.airborne import airborne
+from scanloom.stages.denoise.asking import met_again
 from scanloom.stages.denoise.bounds import bounded
 from scanloom.stages.denoise.moving import Movers
 from scanloom.stages.denoise.settings import Settings
