@@ -31,7 +31,8 @@ from scanloom.schemas.tiles import Overview, TileIndex
 from tests.browser import Page, chromium
 
 SEEN = "window.scanloom && scanloom.cloud.shown > 0"
-DONE = f"{SEEN} && !scanloom.cloud.busy"
+DRAWN = "!scanloom.dirty && !scanloom.stale && scanloom.view.drawingTook() !== null"
+DONE = f"{SEEN} && !scanloom.cloud.busy && {DRAWN}"
 
 
 def main() -> None:

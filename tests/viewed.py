@@ -7,11 +7,14 @@ import threading
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.objects import ObjectClass, ObjectTracks
-from scanloom.schemas.product import columns_of
+from scanloom.schemas.product import FOOTER_KEY, columns_of
 from scanloom.schemas.scans import PointClass
+from scanloom.schemas.tiles import RemovedTile, TileIndex
 from scanloom.stages.exports.glb import VERTEX
 from scanloom.stages.geometry.geodesy import georeference
 from scanloom.stages.geometry.se3 import pose
@@ -25,6 +28,7 @@ POINTS = 30_000
 SCANS = 40
 INTENSITIES = np.linspace(0, 60, POINTS).astype(np.float32)
 """Of each point its own: they tell which is which."""
+FIRST_NS = 1_760_000_000_000_000_000
 PLY = b"""ply
 format binary_little_endian 1.0
 comment scanloom points left out of the map
@@ -53,7 +57,7 @@ def make_map(folder: Path, *, removed: int = 0) -> None:
         "class_": np.where(np.arange(POINTS) < POINTS - 5_000, PointClass.GROUND, PointClass.STATIC).astype(
             np.uint8
         ),
-        "first_ns": np.arange(POINTS, dtype=np.int64) + 1_760_000_000_000_000_000,
+        "first_ns": np.arange(POINTS, dtype=np.int64) + FIRST_NS,
     }
     tiles = cut(scene(), columns=columns, georeference=ORIGIN.model_dump(), sessions=("drive",))
     write_map(folder, tiles, name="Old town")
@@ -62,14 +66,55 @@ def make_map(folder: Path, *, removed: int = 0) -> None:
     _loops().write(folder / "loops.parquet")
     _car().write(folder / "objects.parquet")
     (folder / "removed.ply").write_bytes(_removed(removed))
+    _removed_tiles(removed, folder / "removed")
+
+
+def removed_places(count: int) -> np.ndarray:
+    """Points (n, 3) that were left out, tile after tile."""
+    places = np.random.default_rng(12).uniform(-30, 30, (count, 3)) * (1, 1, 0.02)
+    return places[np.lexsort(np.floor(places[:, 1::-1] / 50.0).T)].astype(np.float32).astype(float)
 
 
 def _removed(count: int) -> bytes:
     rows = np.zeros(count, np.dtype([("p", "<f4", 3), ("intensity", "<f4"), ("class", "u1")]))
-    places = np.random.default_rng(12).uniform(-30, 30, (count, 3)) * (1, 1, 0.02)
-    rows["p"] = places[np.lexsort(np.floor(places[:, 1::-1] / 50.0).T)]
+    rows["p"] = removed_places(count)
     rows["class"] = PointClass.DYNAMIC
     return PLY % count + rows.tobytes()
+
+
+def _removed_tiles(count: int, folder: Path) -> None:
+    """The same points with all that is known of them; stamps are their numbers."""
+    folder.mkdir()
+    columns = {
+        "class_": np.full(count, PointClass.DYNAMIC, np.uint8),
+        "first_ns": np.arange(count, dtype=np.int64) + FIRST_NS,
+    }
+    for name, tile in cut(removed_places(count), columns=columns, sessions=("drive",)).items():
+        fields = {key: getattr(tile, key) for key in columns_of(RemovedTile)}
+        RemovedTile(**fields, **tile.attributes).write(folder / f"{name}.parquet")
+
+
+def paint(folder: Path) -> None:
+    """Colours for what lies east of the middle, in the columns that cameras fill: red grows with x, blue is full."""
+    names = TileIndex.open(folder / "tiles" / "index.parquet").names
+    across = np.array([float(name.split("_")[0]) for name in names]) * 50.0
+    for path in (folder / "tiles").glob("*.parquet"):
+        if path.stem == "index":
+            continue
+        table = pq.read_table(path)
+        tile = table["tile"].to_numpy() if path.stem == "overview" else names.index(path.stem)
+        x_m = table["x_m"].to_numpy() + across[tile]
+        colours = {
+            "red": np.clip(x_m * 8.0, 1, 255),
+            "green": np.zeros(len(x_m)),
+            "blue": np.full(len(x_m), 255),
+        }
+        painted = table
+        for name, value in colours.items():
+            column = np.where(x_m > 0.0, value, 0).astype(np.uint8)
+            painted = painted.append_column(name, pa.array(column))
+        footer = {FOOTER_KEY: pq.read_metadata(path).metadata[FOOTER_KEY]}
+        pq.write_table(painted.replace_schema_metadata(footer), path, write_page_checksum=True)
 
 
 def _loops() -> Loops:

@@ -21,6 +21,8 @@ from scanloom.stages.exports.source import MapSource
 
 Columns = dict[str, NDArray[Any]]
 COLUMNS = ("x_m", "y_m", "z_m", "intensity", "class_", "count", "first_ns", "last_ns", "session", "normal")
+COLOUR = ("red", "green", "blue")
+"""Columns that tiles have where cameras saw the map; black stands for a point that none saw."""
 CACHE_BYTES = 256 << 20
 UNCLASSIFIED, STATIC, GROUND = 0, 2, 1
 _TINTS = {GROUND: (0.93, 0.86, 0.74), STATIC: (0.80, 0.90, 1.0)}
@@ -84,6 +86,7 @@ class NodeReader:
         self._recent = Recent(cache_bytes)
         self._overview = source.folder / "tiles" / "overview.parquet"
         self._overview_level = self._lowest_of_overview()
+        self.coloured = self._has_colour()
         # Rows of the overview are ordered by tile within a level.
         self._before = np.cumsum(self.levels.points, axis=0) - self.levels.points
 
@@ -113,7 +116,7 @@ class NodeReader:
             for level in range(node.coarsest, node.finest - 1, -1)
             for tile in self._groups(level, node)
         ]
-        names = COLUMNS[3:]
+        names = COLUMNS[3:] + COLOUR * self.coloured
         xyz = [self._offset_of(tiles) + _xyz(columns) for tiles, columns in parts]
         joined = {name: np.concatenate([columns[name] for _, columns in parts]) for name in names}
         return Points(np.concatenate(xyz), joined)
@@ -203,6 +206,21 @@ class NodeReader:
             )
         return int(fits[0])
 
+    def _has_colour(self) -> bool:
+        """Whether any cloud of the map has colours; one that is not there says so when it is read."""
+        paths = [
+            self._overview,
+            *(self.source.folder / "tiles" / f"{name}.parquet" for name in self.levels.names[:1]),
+        ]
+        try:
+            return any(
+                set(COLOUR) <= set(pq.read_schema(path, memory_map=False).names)
+                for path in paths
+                if path.exists()
+            )
+        except (OSError, ValueError):
+            return False
+
     def _read(self, path: Path, first: int, last: int) -> Columns:
         """Rows of a file, from the row groups that hold them."""
         try:
@@ -210,13 +228,16 @@ class NodeReader:
             ends = np.cumsum([file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)])
             begins = np.concatenate(([0], ends[:-1]))
             groups = np.flatnonzero((ends > first) & (begins < last))
-            table = file.read_row_groups(groups.tolist(), columns=list(COLUMNS), use_threads=False)
+            known = [name for name in COLUMNS + COLOUR * self.coloured if name in file.schema_arrow.names]
+            table = file.read_row_groups(groups.tolist(), columns=known, use_threads=False)
         except (OSError, ValueError) as error:
             raise InvalidInput(
                 f"cannot be read: {error}", where=str(path), next_step="make the map again"
             ) from error
         table = table.slice(first - int(begins[groups[0]]), last - first)
-        columns = {name: _numpy(table.column(name)) for name in COLUMNS}
+        columns = {name: _numpy(table.column(name)) for name in known}
+        for name in set(COLOUR * self.coloured) - set(known):
+            columns[name] = np.zeros(len(table), np.uint8)
         columns["session"] = self._renumbered(file, columns["session"])
         return columns
 
@@ -235,6 +256,10 @@ def vertices(points: Points, centre_m: NDArray[np.float64]) -> NDArray[Any]:
     out = np.zeros(len(points), VERTEX)
     out["position"] = points.xyz_m - centre_m
     out["colour"] = _colours(points.columns["intensity"], points.columns["class_"])
+    if COLOUR[0] in points.columns:
+        seen = np.column_stack([points.columns[name] for name in COLOUR])
+        coloured = seen.any(axis=1)
+        out["colour"][coloured, :3] = seen[coloured]
     out["intensity"] = points.columns["intensity"]
     out["class"][:, 0] = points.columns["class_"]
     out["normal"][:, :3] = points.columns["normal"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from PIL import Image
 from scanloom.stages.geometry.geodesy import world_to_projected
 from scanloom.workflows.viewer.server import Server
 from tests.browser import Page, chromium
-from tests.viewed import ORIGIN, POINTS, Running, make_map, scene
+from tests.viewed import ORIGIN, POINTS, Running, make_map, paint, removed_places, scene
 
 pytestmark = pytest.mark.slow
 WIDTH, HEIGHT = 1000, 700
@@ -206,6 +207,54 @@ def test_distances_are_measured(page: Page) -> None:
     assert np.linalg.norm(steps[:, :2], axis=1).sum() == pytest.approx(metres, rel=0.08)
     page.key("Escape")
     assert page.run("scanloom.overlay.line.length") == 0
+
+
+def test_a_removed_point_is_picked_and_says_why(page: Page) -> None:
+    page.run("scanloom.use(true); scanloom.fit(); scanloom.clear()")
+    page.run("document.querySelector('[data-layer=removed]').click()")
+    page.run("document.querySelector('[data-layer=points]').click()")
+    page.wait(
+        "scanloom.removed && scanloom.removed.shown > 0 && !scanloom.removed.busy && !scanloom.dirty && !scanloom.stale"
+    )
+    places, found = removed_places(REMOVED), 0
+    for x, y, z in places[::250]:
+        at = page.run(
+            f"(() => {{ const V = scanloom.low.constructor; return scanloom.view.project(new V({x}, {y}, {z})); }})()"
+        )
+        if not (340 < at["x"] < WIDTH - 20 and 80 < at["y"] < HEIGHT - 80):
+            continue
+        page.run("scanloom.about = null; scanloom.clear()")
+        page.click(at["x"], at["y"])
+        page.wait("scanloom.about")
+        about = page.run("scanloom.about")
+        assert about["class"] == "dynamic" and "moved" in about["why"]
+        assert np.abs(places - about["map_m"]).max(axis=1).min() < 1e-3
+        found += 1
+    assert found >= 4
+    assert "moved" in dict(page.run(ACROSS))["Left out since"]
+    page.key("Escape")
+    page.run("document.querySelector('[data-layer=removed]').click()")
+    page.run("document.querySelector('[data-layer=points]').click()")
+
+
+def test_cameras_are_offered_only_where_they_saw_something(page: Page, tmp_path: Path) -> None:
+    assert page.run("document.querySelector('[data-mode=camera]')") is None
+    make_map(tmp_path / "m")
+    paint(tmp_path / "m")
+    with Running(tmp_path / "m") as server, chromium() as tab:
+        tab.resize(WIDTH, HEIGHT)
+        tab.open(server.url)
+        tab.wait(READY)
+        tab.run("document.querySelector('[data-mode=camera]').click()")
+        tab.run("scanloom.use(true); scanloom.fit()")
+        tab.run("document.getElementById('shading').click()")
+        picture = pixels(tab)
+        blue = (picture[:, :, 2] > 200) & (picture[:, :, 1] < 30)
+        columns = np.flatnonzero(blue.any(axis=0))
+        assert 0.02 < blue.mean() < 0.6 and columns.min() > picture.shape[1] * 0.4
+        red = [picture[:, c, 0][blue[:, c]].mean() for c in (columns[5], columns[-5])]
+        assert red[0] < 40 and red[1] > 150
+        assert tab.errors() == []
 
 
 def test_budget_bounds_what_is_shown(page: Page) -> None:

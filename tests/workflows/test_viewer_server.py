@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import shutil
 import socket
 import struct
 from collections.abc import Iterator
@@ -17,7 +18,18 @@ from scanloom.schemas.scans import PointClass
 from scanloom.stages.geometry.geodesy import projected_to_world
 from scanloom.workflows.view_map import view_map
 from scanloom.workflows.viewer.server import LOOPBACK, Server
-from tests.viewed import INTENSITIES, ORIGIN, POINTS, Running, make_map, points_of, scene
+from tests.viewed import (
+    FIRST_NS,
+    INTENSITIES,
+    ORIGIN,
+    POINTS,
+    Running,
+    make_map,
+    paint,
+    points_of,
+    removed_places,
+    scene,
+)
 
 
 @pytest.fixture(scope="module")
@@ -108,9 +120,52 @@ def test_a_point_is_told_in_the_maps_own_system(served: Server) -> None:
     assert about["first_ns"] == str(1_760_000_000_000_000_000 + number)
 
 
+@pytest.mark.parametrize("kind", ["root.glb", "blocks/"])
+def test_a_removed_point_tells_why_it_was_left_out(served: Server, kind: str) -> None:
+    path = next(p for p in contents(served, "/data/removed/tileset.json") if kind in p)
+    vertices, places = points_of(ask(served, path)[1])
+    row = len(vertices) // 3
+    node = path.removeprefix("/data/removed/").removesuffix(".glb")
+    about = json_of(served, f"/data/removed/point/{node}/{row}")
+    assert np.allclose(about["map_m"], places[row], atol=1e-4)
+    assert about["class"] == "dynamic" and "moved" in about["why"]
+    number = int(about["first_ns"]) - FIRST_NS
+    assert np.allclose(removed_places(120_000)[number], about["map_m"], atol=0.02)
+    assert about["session"] == "drive"
+    projected = [about["easting_m"], about["northing_m"], about["height_m"]]
+    assert np.allclose(projected_to_world(ORIGIN, projected)[0], places[row], atol=1e-3)
+
+
+def test_a_removed_point_without_its_tile_is_told_by_its_class(tmp_path: Path) -> None:
+    make_map(tmp_path / "m", removed=50)
+    shutil.rmtree(tmp_path / "m" / "removed")
+    with Running(tmp_path / "m") as server:
+        about = json_of(server, "/data/removed/point/root/49")
+        assert about["class"] == "dynamic" and "first_ns" not in about
+        assert ask(server, "/data/removed/point/root/50")[0].status == 404
+
+
+def test_colour_is_there_when_tiles_have_it(served: Server, tmp_path: Path) -> None:
+    assert json_of(served, "/data/map.json")["coloured"] is False
+    make_map(tmp_path / "m")
+    paint(tmp_path / "m")
+    with Running(tmp_path / "m") as server:
+        assert json_of(server, "/data/map.json")["coloured"] is True
+        path = next(p for p in contents(server, "/data/tileset/tileset.json") if "0_0/" in p)
+        vertices, places = points_of(ask(server, path)[1])
+        assert len(vertices) and (vertices["colour"][:, 2] == 255).all() and (places[:, 0] > 0).all()
+        assert np.abs(vertices["colour"][:, 0] - np.clip(places[:, 0] * 8.0, 1, 255)).max() <= 1.01
+        west = next(p for p in contents(server, "/data/tileset/tileset.json") if "-1_0/" in p)
+        grey, _ = points_of(ask(server, west)[1])
+        assert (grey["colour"][:, :3].astype(int).sum(axis=1) > 100).all()
+        node = path.removeprefix("/data/tileset/").removesuffix(".glb")
+        assert json_of(server, f"/data/point/{node}/0")["colour"] == vertices["colour"][0, :3].tolist()
+
+
 @pytest.mark.parametrize(
     "path",
     [
+        "/data/removed/point/root/-1", "/data/removed/point/root/x", "/data/removed/point/nothing/0", "/data/removed/point/",
         "/data/", "/data/nothing", "/data/tileset/", "/data/tileset/nothing.glb", "/data/tileset/tiles/9_9.json",
         "/data/tileset/tiles/0_0/0_99_0_0.glb", "/data/tileset/tiles/0_0.glb", "/data/tileset/../map.json",
         "/data/point/root/-1", "/data/point/root/99999999", "/data/point/root/x", "/data/point/nothing/0",

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scanloom.schemas.scans import PointClass
-from scanloom.stages.exports.node_points import NodeReader, Points
+from scanloom.stages.exports.node_points import COLOUR, NodeReader, Points
 from scanloom.stages.exports.nodes import ROOT_POINTS, Node
 from scanloom.stages.exports.source import MapSource
 from scanloom.stages.exports.tiles3d import map_tileset, tile_tileset
@@ -56,7 +57,7 @@ class Answers:
             "map.json": self._summary,
             "layers.json": self._layers,
             "tileset": self._tileset,
-            "removed": self.removed.answer,
+            "removed": self._removed,
             "point": self._point,
         }
         if head not in kinds:
@@ -120,11 +121,20 @@ class Answers:
                 "intensity": _spread(sample.columns["intensity"]),
                 "classes": {int(c): PointClass(c).name.lower() for c in np.unique(sample.columns["class_"])},
                 "removed": self.removed.summary(),
+                "coloured": self.reader.coloured,
             }
         )
 
     def _layers(self, _: str) -> tuple[str, bytes]:
         return _json(self.layers.everything())
+
+    def _removed(self, path: str) -> tuple[str, bytes]:
+        """Its tileset and contents, and `point/NODE/ROW`: one point, why it was left out, and where."""
+        if not path.startswith("point/"):
+            return self.removed.answer(path)
+        name, _, row = path.removeprefix("point/").rpartition("/")
+        about = self.removed.point(name.removeprefix("blocks/"), int(row))
+        return _json(about | self._place(np.array(about["map_m"])))
 
     def _point(self, path: str) -> tuple[str, bytes]:
         """`NODE/ROW`: everything that is known of one point."""
@@ -147,15 +157,21 @@ class Answers:
             "last_ns": str(value["last_ns"]),
             "normal": (value["normal"] / 127.0).tolist() if value["normal"].any() else None,
         }
+        if self.reader.coloured:
+            about["colour"] = [int(value[name]) for name in COLOUR]
+        return about | self._place(xyz)
+
+    def _place(self, xyz: NDArray[np.float64]) -> Json:
+        """Where a point (3,) of the map's frame is on the Earth; nothing without a georeference."""
         georeference = self.source.georeference
-        if georeference is not None:
-            easting, northing, height = world_to_projected(georeference, xyz)[0].tolist()
-            latitude, longitude, _ = world_to_geodetic(georeference, xyz)[0].tolist()
-            about |= {
-                "epsg": georeference.epsg, "easting_m": easting, "northing_m": northing, "height_m": height,
-                "latitude_deg": latitude, "longitude_deg": longitude,
-            }  # fmt: skip
-        return about
+        if georeference is None:
+            return {}
+        easting, northing, height = world_to_projected(georeference, xyz)[0].tolist()
+        latitude, longitude, _ = world_to_geodetic(georeference, xyz)[0].tolist()
+        return {
+            "epsg": georeference.epsg, "easting_m": easting, "northing_m": northing, "height_m": height,
+            "latitude_deg": latitude, "longitude_deg": longitude,
+        }  # fmt: skip
 
 
 def crs_name(epsg: int) -> str:

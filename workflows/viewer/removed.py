@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.schemas.scans import PointClass
+from scanloom.schemas.tiles import RemovedTile
 from scanloom.stages.exports.glb import VERTEX, glb
 from scanloom.stages.exports.nodes import Node
 from scanloom.stages.exports.source import MapSource
@@ -21,10 +22,21 @@ MOST_PER_TILE = 200_000
 """Points of one tile that are shown; of more every n-th is."""
 
 
+NEAR_M = 0.02
+"""A removed point of the picture is the one of its tile that lies this near: coordinates of the file have 32 bits."""
+WHY = {
+    PointClass.DYNAMIC: "it moved while it was seen: a tracked vehicle or person, or what rays saw through at other times",
+    PointClass.AIRBORNE: "it hung in the air: dust, rain or snow",
+    PointClass.OUTLIER: "it is a stray: nothing measured near it, in its scan or its neighbours, bears it out",
+    PointClass.CHANGED: "it stood while one session passed and was gone when a later one saw through its place",
+}
+
+
 class Removed:
     """The file is mapped into memory, not read; places of tiles in it are found when somebody asks first."""
 
     def __init__(self, source: MapSource) -> None:
+        self._tiles = source.folder / "removed"
         self._path = source.folder / "removed.ply"
         self._tile_m = source.index.tile_size_m
 
@@ -49,6 +61,46 @@ class Removed:
         vertices["class"][:, 0] = points["class"]
         x, y, z = centre.tolist()
         return "model/gltf-binary", glb(vertices, (x, y, z))
+
+    def point(self, name: str, row: int) -> dict[str, Any]:
+        """What is known of a point of a node: place in the map's frame, class, why it was left out, when it was seen.
+
+        Raises
+        ------
+        KeyError, IndexError : there is no such node or row.
+        """
+        rows = self._rows({node.name: node for node in self._root.walk()}[name])
+        if not 0 <= row < len(rows):
+            raise IndexError(row)
+        point = self._points[int(rows[row])]
+        xyz = [float(point[axis]) for axis in "xyz"]
+        class_ = PointClass(int(point["class"]))
+        about = {
+            "map_m": xyz,
+            "class": class_.name.lower(),
+            "intensity": float(point["intensity"]),
+            "why": WHY.get(class_, ""),
+        }
+        return about | self._seen(np.array(xyz), class_)
+
+    def _seen(self, xyz: NDArray[np.float64], class_: PointClass) -> dict[str, Any]:
+        """Session, count and stamps, from the tile of removed points; nothing when it is not there."""
+        x, y = np.floor(xyz[:2] / self._tile_m).astype(int)
+        path = self._tiles / f"{x}_{y}.parquet"
+        if not path.exists():
+            return {}
+        tile = RemovedTile.open(path)
+        places = np.column_stack((tile.x_m, tile.y_m, tile.z_m)) + np.array(tile.offset_m)
+        off = np.where(tile.class_ == class_, np.abs(places - xyz).max(axis=1), np.inf)
+        nearest = int(np.argmin(off)) if len(off) else -1
+        if nearest < 0 or off[nearest] > NEAR_M:
+            return {}
+        return {
+            "count": int(tile.count[nearest]),
+            "session": tile.sessions[int(tile.session[nearest])],
+            "first_ns": str(tile.first_ns[nearest]),
+            "last_ns": str(tile.last_ns[nearest]),
+        }
 
     @cached_property
     def _points(self) -> NDArray[Any]:

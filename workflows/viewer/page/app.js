@@ -1,7 +1,7 @@
 // The page: opens the map, wires panel, pointer and keys to the picture, draws when something has changed.
 
 import { Vector3 } from "./vendor.js";
-import { Cloud, MODES, pointMaterial } from "./cloud.js";
+import { Cloud, MODES, modesOf, pointMaterial } from "./cloud.js";
 import { lineLayers } from "./layers.js";
 import { Overlay } from "./measure.js";
 import { $, classColours, colourButtons, describeMap, layerSwitch, number, objectColours, pointRows, showCard, showMode } from "./panel.js";
@@ -9,6 +9,8 @@ import { pick } from "./picking.js";
 import { View } from "./scene.js";
 
 const DATA = "/data/";
+const PATIENCE = 5; // while points arrive a fifth of the time is spent on drawing them
+const LONGEST_MS = 2000;
 const narrow = () => matchMedia("(max-width: 640px)").matches;
 
 class App {
@@ -100,7 +102,7 @@ class App {
   // --- points ---
 
   click(x, y) {
-    const found = pick(this.view, this.cloud, x, y, this.material.uniforms.hidden.value);
+    const found = pick(this.view, [this.cloud, this.removed].filter(Boolean), x, y);
     if (!found) return null;
     if (this.measuring) this.addCorner(found.point);
     else this.describe(found);
@@ -117,21 +119,27 @@ class App {
 
   async describe(found) {
     this.overlay.picked = found.point;
-    const answer = await fetch(`${DATA}point/${found.part.userData.node}/${found.row}`);
+    const kind = found.cloud === this.removed ? "removed/point" : "point";
+    const answer = await fetch(`${DATA}${kind}/${found.part.userData.node}/${found.row}`);
     if (!answer.ok || this.overlay.picked !== found.point) return;
     const about = await answer.json();
     this.about = about;
     const text = about.epsg
       ? `${about.easting_m.toFixed(3)} ${about.northing_m.toFixed(3)} ${about.height_m.toFixed(3)} EPSG:${about.epsg}`
       : about.map_m.map((v) => v.toFixed(3)).join(" ");
-    showCard(about.epsg ? `Point in EPSG:${about.epsg}` : "Point", pointRows(about), text);
+    const what = about.why ? "Removed point" : "Point";
+    showCard(about.epsg ? `${what} in EPSG:${about.epsg}` : what, pointRows(about), text);
   }
 
   // --- drawing ---
 
-  // What the user does is seen at once, what arrives a few times a second.
+  // What the user does is seen at once. What arrives is seen a few times a second, and where drawing is slow less often, so
+  // that it leaves most of the time to reading.
   due(now) {
-    if (!this.dirty && !(this.stale && now - this.drawn > 120)) return false;
+    const cost = this.view.drawingTook();
+    const rest = cost === null ? Infinity : Math.max(120, PATIENCE * cost);
+    const waited = this.cloud.busy || this.removed?.busy ? now - this.drawn > Math.min(rest, LONGEST_MS) : cost !== null;
+    if (!this.dirty && !(this.stale && waited)) return false;
     this.dirty = this.stale = false;
     this.drawn = now;
     return true;
@@ -180,7 +188,7 @@ function say(text) {
 
 function wire(app) {
   const canvas = $("canvas");
-  colourButtons((mode) => app.colour(mode));
+  colourButtons(app.map, (mode) => app.colour(mode));
   $("top").addEventListener("click", () => app.use(true));
   $("perspective").addEventListener("click", () => app.use(false));
   $("fit").addEventListener("click", () => app.fit());
@@ -222,7 +230,7 @@ function key(app, event) {
     ArrowLeft: () => app.view.pan(-1, 0), ArrowRight: () => app.view.pan(1, 0), ArrowUp: () => app.view.pan(0, 1), ArrowDown: () => app.view.pan(0, -1),
     Escape: () => { app.measure(false); app.clear(); },
   };
-  MODES.forEach((mode, i) => { keys[String(i + 1)] = () => app.colour(mode); });
+  modesOf(app.map).forEach((mode, i) => { keys[String(i + 1)] = () => app.colour(mode); });
   const act = keys[event.key] ?? keys[event.key.toLowerCase()];
   if (!act) return;
   event.preventDefault();

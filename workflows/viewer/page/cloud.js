@@ -3,13 +3,15 @@
 import { ShaderMaterial, TilesRenderer, Vector2 } from "./vendor.js";
 import { RAMPS, classTable, ramp, sessionTable } from "./palette.js";
 
-export const MODES = ["height", "intensity", "class", "session"];
+export const MODES = ["height", "intensity", "class", "session", "camera"];
+export const modesOf = (map) => MODES.filter((mode) => mode !== "camera" || map.coloured);
 
 const VERTEX = `
 attribute float _intensity;
 attribute float _classification;
 attribute float _session;
 attribute vec3 _normal;
+attribute vec4 color;
 uniform int mode;
 uniform vec2 heights, intensities;
 uniform sampler2D heightRamp, intensityRamp, classes, sessions;
@@ -28,9 +30,10 @@ void main() {
   if (mode == 0) colour = texture2D(heightRamp, vec2(within(heights, world.z), 0.5)).rgb * (0.62 + 0.38 * bright);
   else if (mode == 1) colour = texture2D(intensityRamp, vec2(bright, 0.5)).rgb;
   else if (mode == 2) colour = texture2D(classes, vec2((_classification + 0.5) / 256.0, 0.5)).rgb * (0.7 + 0.3 * bright);
+  else if (mode == 4) colour = color.rgb;
   else colour = texture2D(sessions, vec2((mod(_session, 256.0) + 0.5) / 256.0, 0.5)).rgb * (0.7 + 0.3 * bright);
   float flat_ = dot(_normal, _normal);
-  if (flat_ > 0.25) colour *= 1.0 - shading * 0.35 * (1.0 - abs(dot(_normal * inversesqrt(flat_), vec3(0.41, 0.25, 0.88))));
+  if (flat_ > 0.25 && mode != 4) colour *= 1.0 - shading * 0.35 * (1.0 - abs(dot(_normal * inversesqrt(flat_), vec3(0.41, 0.25, 0.88))));
   // As large as a voxel when near, no smaller than a few pixels when far.
   float near = projectionMatrix[3][3] == 1.0 ? metres * perMetre : metres * perMetre / max(-seen.z, 0.01);
   gl_PointSize = clamp(near, pixels, 24.0 + pixels);

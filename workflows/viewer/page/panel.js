@@ -1,7 +1,7 @@
 // The panel: what can be chosen, and what the colours mean.
 
 import { CLASSES, OBJECTS, RAMPS, gradient, sessionColour } from "./palette.js";
-import { MODES } from "./cloud.js";
+import { modesOf } from "./cloud.js";
 
 export const $ = (id) => document.getElementById(id);
 export const number = (value) => Math.round(value).toLocaleString("en").replaceAll(",", " ");
@@ -24,8 +24,9 @@ export function describeMap(map) {
   $("crs").textContent = `${place} · ${across[0]} × ${across[1]} m · ${number(map.points)} points`;
 }
 
-export function colourButtons(choose) {
-  MODES.forEach((mode, i) => {
+export function colourButtons(map, choose) {
+  $("last-mode").textContent = String(modesOf(map).length);
+  modesOf(map).forEach((mode, i) => {
     const button = element("button", { role: "radio", "data-mode": mode, title: String(i + 1) }, mode[0].toUpperCase() + mode.slice(1));
     button.addEventListener("click", () => choose(mode));
     $("colours").append(button);
@@ -38,6 +39,8 @@ export function showMode(mode, map) {
   legend.replaceChildren();
   if (mode === "class") {
     legend.append(swatches(Object.values(map.classes).map((name) => [name, CLASSES[name]])));
+  } else if (mode === "camera") {
+    legend.append(element("p", { class: "quiet" }, "As cameras saw it; grey where none did."));
   } else if (mode === "session") {
     legend.append(swatches(map.sessions.map((name, i) => [name, sessionColour(i)])));
   } else {
@@ -88,6 +91,8 @@ export function pointRows(about) {
   }
   rows.push(["Map x, y, z", about.map_m.map((v) => v.toFixed(3)).join(", ")]);
   rows.push(["Class", about.class.replaceAll("_", " ")], ["Intensity", about.intensity.toPrecision(4)]);
+  if (about.why) rows.push(["Left out since", about.why]);
+  if (about.colour?.some((v) => v)) rows.push(["Colour", `rgb(${about.colour.join(", ")})`]);
   if (about.count !== undefined) rows.push(["Points averaged", String(about.count)]);
   if (about.session) rows.push(["Session", about.session]);
   if (about.first_ns && about.first_ns !== "0") rows.push(["First seen", time(about.first_ns)], ["Last seen", time(about.last_ns)]);

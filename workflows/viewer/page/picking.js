@@ -4,7 +4,7 @@ import { Matrix4, Sphere, Vector3 } from "./vendor.js";
 
 const REACH_PIXELS = 7;
 
-export function pick(view, cloud, x, y, hidden) {
+export function pick(view, clouds, x, y) {
   const camera = view.camera;
   const at = { x: (x / view.size.x) * 2 - 1, y: 1 - (y / view.size.y) * 2 };
   const flat = view.isTop;
@@ -15,9 +15,12 @@ export function pick(view, cloud, x, y, hidden) {
   const perPixel = ratio / view.perMetre; // metres of a pixel: per metre of distance, or as such from above
   const wide = REACH_PIXELS * perPixel;
   let best = null;
-  for (const part of cloud.parts()) {
-    const found = nearest(part, origin, direction, wide, perPixel, flat, hidden);
-    if (found && (!best || found.score < best.score)) best = found;
+  for (const cloud of clouds) {
+    const hidden = cloud.material.uniforms.hidden.value;
+    for (const part of cloud.parts()) {
+      const found = nearest(part, origin, direction, wide, perPixel, flat, hidden);
+      if (found && (!best || found.score < best.score)) best = { ...found, cloud };
+    }
   }
   return best && { ...best, point: best.local.applyMatrix4(best.part.matrixWorld) };
 }

@@ -47,6 +47,8 @@ export class View {
     this.camera = this.perspective;
     this.shading = true;
     this.extent = 100;
+    this.fence = null;
+    this.took = 0;
     this.controls = {};
     for (const [name, camera] of [["perspective", this.perspective], ["top", this.top]]) {
       camera.up.set(0, 0, 1);
@@ -198,6 +200,27 @@ export class View {
       renderer.render(this.scene, this.camera);
     }
     renderer.render(this.lines, this.camera);
+    this.watch();
+  }
+
+  // The card is told to say when it has drawn this picture; it works on its own, behind the calls above.
+  watch() {
+    const gl = this.renderer.getContext();
+    if (this.fence) gl.deleteSync(this.fence);
+    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    this.began = performance.now();
+  }
+
+  // Milliseconds that the last picture took; null while it is being drawn.
+  drawingTook() {
+    if (!this.fence) return this.took;
+    const gl = this.renderer.getContext();
+    if (gl.getSyncParameter(this.fence, gl.SYNC_STATUS) !== gl.SIGNALED) return null;
+    gl.deleteSync(this.fence);
+    this.fence = null;
+    this.took = performance.now() - this.began;
+    return this.took;
   }
 
   // Where a point of the map is on the screen, CSS pixels; null behind the camera.
