@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from scanloom.stages.calibrate.cloud.evidence import Evidence
 from scanloom.stages.calibrate.cloud.sweep import B1, I8
 from scanloom.stages.geometry.se3 import F8
 
@@ -39,6 +40,12 @@ class CloudBoard:
     """By how much dark print reads farther than bright print."""
     flare_m: float
     """By how much the board looks larger on each side."""
+    crossing_m: float
+    """How far before the axis beams cross; weakly known from one board."""
+    farther_m: float
+    """How much too far all ranges read, by the size of squares and outline; weakly known from one board."""
+    evidence: Evidence
+    """All of it for a graph, with the errors of the sensor as unknowns."""
     corners_m: F8
     """(m*n, 3) virtual corners, ordered as `Board.corners_m`."""
     corner_covariance: F8

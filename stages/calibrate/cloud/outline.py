@@ -13,7 +13,7 @@ from scanloom.stages.calibrate.cloud.sweep import B1
 from scanloom.stages.geometry.se3 import F8
 
 _ANGLES = 18
-_REFINED = 4
+_REFINED = 2
 _BLUR_M = 0.004
 """How unevenly an edge is hit beyond the distance of two rays."""
 _LOOSE = 0.5
@@ -80,7 +80,7 @@ def measured(patch: Patch, edges: Edges) -> Rectangle | None:
     best = None
     for start in _starts(middle[~edges.across]):
         guess = start[3:].copy()
-        fit = least_squares(residuals, start, loss="cauchy", f_scale=2.0, max_nfev=40)
+        fit = least_squares(residuals, start, loss="cauchy", f_scale=2.0, max_nfev=20)
         if best is None or fit.cost < best.cost:
             best = fit
     if best is None:

@@ -1,7 +1,11 @@
 """Pose of a board of known size from everything the sensor says about it: ranges, edges and squares, in one fit.
 
 Unknown beside the pose: by how much beams of some width make the board look larger, by how much dark print reads farther
-than bright print, and for every beam its error of range and what it calls dark and bright.
+than bright print, where the beams cross, by how much all ranges are off, and for every beam its error of range and what it calls dark and bright.
+
+Clouds are written as if all beams left the origin. In many sensors they do not: those of a VLP-16 cross 42 mm before its
+axis (its manual's table of vertical offsets, 11.2 mm at 15 degrees), which few drivers know. A point at elevation e is then
+h tan(e) lower than the cloud says, and a board at 2 m looks 2 % too tall.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ import numpy as np
 
 from scanloom.stages.calibrate.board import Board
 from scanloom.stages.calibrate.cloud.edges import Edges
+from scanloom.stages.calibrate.cloud.evidence import Evidence, evidence_of
 from scanloom.stages.calibrate.cloud.outline import outside_by
 from scanloom.stages.calibrate.cloud.patches import Patch
 from scanloom.stages.calibrate.cloud.pattern import dark_share
@@ -20,16 +25,25 @@ from scanloom.stages.calibrate.cloud.sweep import B1, I8, Sweep
 from scanloom.stages.geometry.se3 import F8, se3_exp
 
 _ROUNDS = 4
+_OUTLIER = 2.5
+"""Standard deviations from which an error is trusted less (Cauchy)."""
 _FLARE_SIGMA_M = 0.008
 """How much larger a board may look on each side."""
 _DARK_SIGMA_M = 0.015
 """How much farther dark print may read."""
+_CROSSING_SIGMA_M = 0.03
+"""How far before or behind the axis beams may cross."""
+_FARTHER_SIGMA_M = 0.02
+"""How much too far all ranges may read; sheets of sensors promise 30 mm."""
+SENSOR_SIGMA_M = np.array([_FLARE_SIGMA_M, _DARK_SIGMA_M, _CROSSING_SIGMA_M, _FARTHER_SIGMA_M])
 _EDGE_SIGMA_M = 0.003
 """How unevenly an edge is hit, beyond the distance of two rays."""
+_ALIKE = 2.0
+"""Neighbouring rays err alike where the blur is not quite as assumed: four of them count as one."""
 _FEWEST_ON_BEAM = 8
 """Points of a beam, at least, for its dark and bright to be told."""
 _LEAST_CONTRAST = 1e-9
-_POSE, _FLARE, _DARKER = slice(0, 6), 6, 7
+_POSE, _SENSOR = slice(0, 6), slice(6, 10)
 
 
 @dataclass(frozen=True)
@@ -42,6 +56,8 @@ class Seen:
     intensity: F8
     beam: I8
     """0, 1, ... without gaps."""
+    beams: I8
+    """What the sensor calls them."""
     inner: B1
     """Not at the end of a run: the range is the board's alone."""
     edges: Edges
@@ -62,10 +78,14 @@ class PoseFit:
     covariance: F8
     flare_m: float
     darker_m: float
+    crossing_m: float
+    farther_m: float
     cost: float
     contrast: float
     """Correlation of the reflectance with the print, beam by beam; 0 where it is not used."""
     rmse_m: float
+    beam_sigma_m: float
+    evidence: Evidence
     seen: Seen
 
 
@@ -81,6 +101,7 @@ def seen_of(sweep: Sweep, patch: Patch, edges: Edges, board: Board, settings: Cl
         range_m=sweep.range_m[rays],
         intensity=sweep.intensity[rays],
         beam=np.unique(beam, return_inverse=True)[1],
+        beams=sweep.name[np.unique(beam)],
         inner=inner,
         edges=edges,
         width_m=settings.footprint_m + settings.divergence_rad * distance,
@@ -95,33 +116,64 @@ def fitted(seen: Seen, T_start: F8, rounds: int = _ROUNDS) -> PoseFit:
     """The pose near a start, by robust least squares; scatter is taken from the residuals and weighed anew each round."""
     from scipy.optimize import least_squares
 
-    T, nuisance = T_start, np.zeros(2)
+    T, sensor = T_start, np.zeros(len(SENSOR_SIGMA_M))
     for _ in range(rounds):
-        scales = _scales(seen, T, nuisance)
+        scales = _scales(seen, T, sensor)
         here = T
 
         def residuals(x: F8, here: F8 = here, scales: _Scales = scales) -> F8:
-            return _residuals(seen, here @ se3_exp(x[_POSE]), x[6:], scales)
+            return _residuals(seen, here @ se3_exp(x[_POSE]), x[_SENSOR], scales)
 
         fit = least_squares(
             residuals,
-            np.concatenate((np.zeros(6), nuisance)),
+            np.concatenate((np.zeros(6), sensor)),
             loss="cauchy",
-            f_scale=2.5,
+            f_scale=_OUTLIER,
             x_scale=_STEPS,
             max_nfev=30,
         )
-        T, nuisance = here @ se3_exp(fit.x[_POSE]), fit.x[6:]
-    covariance = np.linalg.pinv(fit.jac.T @ fit.jac)[_POSE, _POSE]
-    gap, _ = _range_gaps(seen, T, nuisance)
-    contrast = _contrast(seen, T)
-    rmse = float(np.sqrt(np.mean(gap**2)))
+        T, sensor = here @ se3_exp(fit.x[_POSE]), fit.x[_SENSOR]
+    gap, _ = _range_gaps(seen, T, sensor)
     return PoseFit(
-        T, covariance, float(nuisance[0]), float(nuisance[1]), float(fit.cost), contrast, rmse, seen
+        T_lidar_board=T,
+        covariance=np.linalg.inv(fit.jac.T @ fit.jac + np.diag(_UNKNOWN))[_POSE, _POSE],
+        flare_m=float(sensor[0]),
+        darker_m=float(sensor[1]),
+        crossing_m=float(sensor[2]),
+        farther_m=float(sensor[3]),
+        cost=float(fit.cost),
+        contrast=_contrast(seen, T, float(sensor[2])),
+        rmse_m=float(np.sqrt(np.mean(gap**2))),
+        beam_sigma_m=scales.beam_m,
+        evidence=_evidence(seen, T, sensor, scales),
+        seen=seen,
     )
 
 
-_STEPS = np.array([0.01, 0.01, 0.01, 0.01, 0.01, 0.01, 0.005, 0.005])
+def _evidence(seen: Seen, T: F8, sensor: F8, scales: _Scales) -> Evidence:
+    """The linear system at the solution: beams' errors of range as unknowns of their own, outliers weighed down."""
+    gap, beam = _range_gaps(seen, T, sensor)
+    count = np.bincount(beam, minlength=len(seen.beams))
+    share = count * scales.beam_m**2 / (count * scales.beam_m**2 + scales.range_m**2)
+    offsets = share * _beam_means(gap, beam, len(seen.beams))
+
+    def errors(x: F8) -> F8:
+        return _errors(seen, T @ se3_exp(x[_POSE]), sensor + x[_SENSOR], scales, offsets)
+
+    here = errors(np.zeros(10))
+    weight = 1 / np.sqrt(1 + (here / _OUTLIER) ** 2)
+    columns = [(errors(_SLIGHT * e) - errors(-_SLIGHT * e)) / (2 * _SLIGHT) for e in np.eye(10)]
+    by_beam = np.zeros((len(here), len(seen.beams)))
+    by_beam[np.arange(len(beam)), beam] = -1 / scales.range_m
+    slopes = np.column_stack((*columns, by_beam)) * weight[:, None]
+    at = np.concatenate((np.zeros(6), sensor, offsets))
+    return evidence_of(T, seen.beams, slopes, weight * here - slopes @ at)
+
+
+_SLIGHT = 1e-5
+_UNKNOWN = np.concatenate((np.full(3, 1.0), np.full(3, 4.0), np.zeros(4)))
+"""Information of a board of which nothing is known: 1 rad and 0.5 m."""
+_STEPS = np.full(10, 0.01)
 
 
 @dataclass(frozen=True)
@@ -135,83 +187,107 @@ class _Scales:
     """Of the reflectance, by beam; infinite where it tells nothing."""
 
 
-def _scales(seen: Seen, T: F8, nuisance: F8) -> _Scales:
-    gap, beam = _range_gaps(seen, T, nuisance)
+def _scales(seen: Seen, T: F8, sensor: F8) -> _Scales:
+    gap, beam = _range_gaps(seen, T, sensor)
     mean = _beam_means(gap, beam, seen.beam.max() + 1)
     within = 1.4826 * np.median(np.abs(gap - mean[beam]))
     sigma = float(np.clip(within, 0.2 * seen.range_sigma_m, 5 * seen.range_sigma_m))
     counts = np.bincount(beam, minlength=len(mean))
     used = counts > 2
+    mean = mean - (np.median(mean[used]) if used.any() else 0.0)
     between = (
         float(np.sum(np.minimum(mean[used] ** 2, 0.05**2) - sigma**2 / counts[used])) if used.any() else 0.0
     )
     prior = 4.0
     beam_sigma = np.sqrt(max(between + prior * seen.beam_sigma_m**2, 1e-8) / (max(used.sum() - 3, 0) + prior))
-    on, off = (outside(seen, T, d) for d in (seen.edges.on, seen.edges.off))
+    on, off = (outside(seen, T, d, sensor[2]) for d in (seen.edges.on, seen.edges.off))
     spread = np.minimum(
-        np.abs(off - on), np.linalg.norm(_hits(T, seen.edges.on) - _hits(T, seen.edges.off), axis=1)
+        np.abs(off - on), np.linalg.norm(_hits(T, seen.edges.on, 0.0) - _hits(T, seen.edges.off, 0.0), axis=1)
     )
     edge = np.sqrt(spread**2 / 12 + _EDGE_SIGMA_M**2) / np.sqrt(seen.edges.weight)
-    return _Scales(sigma, float(beam_sigma), edge, _light_scales(seen, T))
+    return _Scales(sigma, float(beam_sigma), edge, _light_scales(seen, T, sensor))
 
 
-def _light_scales(seen: Seen, T: F8) -> F8:
+def _light_scales(seen: Seen, T: F8, sensor: F8) -> F8:
     beams = seen.beam.max() + 1
     if not seen.squares:
         return np.full(beams, np.inf)
-    off, gain = _light_gaps(seen, T)
+    off, gain = _light_gaps(seen, T, sensor[2])
     out = np.full(beams, np.inf)
     for k in range(beams):
         mine = seen.beam == k
         if mine.sum() >= _FEWEST_ON_BEAM and gain[k] > _LEAST_CONTRAST:
-            out[k] = max(1.4826 * np.median(np.abs(off[mine])), np.std(off[mine]) / 2, 0.05 * gain[k])
+            out[k] = _ALIKE * max(
+                1.4826 * np.median(np.abs(off[mine])), np.std(off[mine]) / 2, 0.05 * gain[k]
+            )
     return out
 
 
-def _residuals(seen: Seen, T: F8, nuisance: F8, scales: _Scales) -> F8:
-    gap, beam = _range_gaps(seen, T, nuisance)
+def _errors(seen: Seen, T: F8, sensor: F8, scales: _Scales, offsets: F8) -> F8:
+    """Everything in units of its noise, for known errors of the beams (k,) and without priors."""
+    gap, beam = _range_gaps(seen, T, sensor)
+    return np.concatenate(((gap - offsets[beam]) / scales.range_m, _other_errors(seen, T, sensor, scales)))
+
+
+def _residuals(seen: Seen, T: F8, sensor: F8, scales: _Scales) -> F8:
+    gap, beam = _range_gaps(seen, T, sensor)
     count = np.bincount(beam, minlength=seen.beam.max() + 1)
     mean = _beam_means(gap, beam, len(count))
     # square root of the inverse of s^2 I + b^2 11': the mean of a beam is trusted less than its points say
     shrink = 1 - 1 / np.sqrt(1 + count * (scales.beam_m / scales.range_m) ** 2)
     ranges = (gap - (shrink * mean)[beam]) / scales.range_m
+    prior = sensor / SENSOR_SIGMA_M
+    return np.concatenate((ranges, prior, _other_errors(seen, T, sensor, scales)))
+
+
+def _other_errors(seen: Seen, T: F8, sensor: F8, scales: _Scales) -> F8:
     middle = seen.edges.on + seen.edges.off
-    edges = (outside(seen, T, middle) - np.where(seen.edges.across, 0.0, nuisance[0])) / scales.edge_m
-    prior = nuisance / (_FLARE_SIGMA_M, _DARK_SIGMA_M)
+    middle = middle / np.linalg.norm(middle, axis=1)[:, None]
+    edges = (
+        outside(seen, T, middle, sensor[2]) - np.where(seen.edges.across, 0.0, sensor[0])
+    ) / scales.edge_m
     if not seen.squares:
-        return np.concatenate((ranges, edges, prior))
-    light, _ = _light_gaps(seen, T)
-    return np.concatenate((ranges, edges, prior, light / scales.light[seen.beam]))
+        return edges
+    light, _ = _light_gaps(seen, T, sensor[2])
+    return np.concatenate((edges, light / scales.light[seen.beam]))
 
 
-def _hits(T: F8, directions: F8) -> F8:
-    """Where rays (n, 3) meet the board's plane (n, 2), in its frame."""
+def _reach(T: F8, directions: F8, crossing_m: float) -> tuple[F8, F8]:
+    """Range (n,) at which rays (n, 3) meet the board's plane, and by how much they start below the origin (n,)."""
     n = T[:3, 2]
-    slope = np.minimum(directions @ n, -1e-3 * np.linalg.norm(directions, axis=1))
-    hit = directions * ((n @ T[:3, 3]) / slope)[:, None]
-    out: F8 = (hit - T[:3, 3]) @ T[:3, :2]
+    slope = np.minimum(directions @ n, -1e-3)
+    low = crossing_m * directions[:, 2] / np.hypot(directions[:, 0], directions[:, 1])
+    return (n @ T[:3, 3] + low * n[2]) / slope, low
+
+
+def _hits(T: F8, directions: F8, crossing_m: float) -> F8:
+    """Where rays (n, 3) meet the board's plane (n, 2), in its frame."""
+    reach, low = _reach(T, directions, crossing_m)
+    hit = directions * reach[:, None] - T[:3, 3]
+    hit[:, 2] -= low
+    out: F8 = hit @ T[:3, :2]
     return out
 
 
-def outside(seen: Seen, T: F8, directions: F8) -> F8:
+def outside(seen: Seen, T: F8, directions: F8, crossing_m: float) -> F8:
     """By how much rays (n, 3) pass the board, m; negative on it."""
     board = seen.board
-    return outside_by(_hits(T, directions), np.asarray(board.offset_m), 0.0, np.asarray(board.board_m) / 2)
+    hits = _hits(T, directions, crossing_m)
+    return outside_by(hits, np.asarray(board.offset_m), 0.0, np.asarray(board.board_m) / 2)
 
 
-def _dark(seen: Seen, T: F8, which: B1 | slice = slice(None)) -> F8:
+def _dark(seen: Seen, T: F8, crossing_m: float, which: B1 | slice = slice(None)) -> F8:
     directions = seen.direction[which]
     blur = np.full(len(directions), max(seen.width_m / 4, 1e-3))
-    return dark_share(seen.board, seen.first_dark, _hits(T, directions), blur)
+    return dark_share(seen.board, seen.first_dark, _hits(T, directions, crossing_m), blur)
 
 
-def _range_gaps(seen: Seen, T: F8, nuisance: F8) -> tuple[F8, I8]:
+def _range_gaps(seen: Seen, T: F8, sensor: F8) -> tuple[F8, I8]:
     """Measured minus expected range of the inner rays, m, and their beams."""
-    n = T[:3, 2]
-    directions = seen.direction[seen.inner]
-    expected = (n @ T[:3, 3]) / np.minimum(directions @ n, -1e-3)
+    reach, _ = _reach(T, seen.direction[seen.inner], sensor[2])
+    expected = reach + sensor[3]
     if seen.squares:
-        expected = expected + nuisance[1] * (_dark(seen, T, seen.inner) - 0.5)
+        expected = expected + sensor[1] * (_dark(seen, T, sensor[2], seen.inner) - 0.5)
     return seen.range_m[seen.inner] - expected, seen.beam[seen.inner]
 
 
@@ -220,9 +296,9 @@ def _beam_means(values: F8, beam: I8, beams: int) -> F8:
     return np.asarray(np.bincount(beam, weights=values, minlength=beams) / count, np.float64)
 
 
-def _light_gaps(seen: Seen, T: F8) -> tuple[F8, F8]:
+def _light_gaps(seen: Seen, T: F8, crossing_m: float) -> tuple[F8, F8]:
     """Reflectance minus what a straight line from dark to bright says, beam by beam; and its rise by beam."""
-    bright = 1.0 - _dark(seen, T)
+    bright = 1.0 - _dark(seen, T, crossing_m)
     beams = int(seen.beam.max()) + 1
     mean_b, mean_i = (_beam_means(v, seen.beam, beams)[seen.beam] for v in (bright, seen.intensity))
     b, i = bright - mean_b, seen.intensity - mean_i
@@ -232,8 +308,8 @@ def _light_gaps(seen: Seen, T: F8) -> tuple[F8, F8]:
     return i - gain[seen.beam] * b, gain
 
 
-def _contrast(seen: Seen, T: F8) -> float:
-    bright = 1.0 - _dark(seen, T)
+def _contrast(seen: Seen, T: F8, crossing_m: float) -> float:
+    bright = 1.0 - _dark(seen, T, crossing_m)
     beams = int(seen.beam.max()) + 1
     b = bright - _beam_means(bright, seen.beam, beams)[seen.beam]
     i = seen.intensity - _beam_means(seen.intensity, seen.beam, beams)[seen.beam]
@@ -249,4 +325,4 @@ def with_squares(seen: Seen, first_dark: bool) -> Seen:
 
 def contrast_of(seen: Seen, T: F8) -> float:
     """Correlation of the reflectance with the print at a pose."""
-    return _contrast(seen, T)
+    return _contrast(seen, T, 0.0)

@@ -27,6 +27,8 @@ _LEAST_CONTRAST = 0.35
 """Correlation of the reflectance with the print from which squares count as seen."""
 _LEAST_OVERLAP = 0.75
 """Rays that are on both piece and board, of those on either."""
+_ROUGH_OVERLAP = 0.6
+"""The same before the fit."""
 _SHIFTS = np.linspace(-1.0, 1.0, 9)
 """Squares by which starts are shifted where the edges leave the place open."""
 
@@ -74,8 +76,8 @@ def search_boards(
                 refused.append(result)
             else:
                 found.append(result)
-    found = _distinct(found, board)
-    refused.sort(key=lambda piece: -piece.points)
+    found, others = _distinct(found, board)
+    refused = sorted(refused + others, key=lambda piece: -piece.points)
     return Search(tuple(found), tuple(refused))
 
 
@@ -91,15 +93,27 @@ def _judged(sweep: Sweep, patch: Patch, board: Board, settings: CloudSettings) -
         return _refused(sweep, patch, f"measures {size}, the board {wanted}")
     seen = seen_of(sweep, patch, edges, board, settings)
     starts = [_start(patch, rectangle, board, turned) for turned, fit in enumerate(ways) if fit]
+    overlap = max(_overlap(sweep, patch, seen, T) for T in starts)
+    if overlap < _ROUGH_OVERLAP:
+        return _apart(sweep, patch, overlap)
     fit = _best(seen, starts, settings)
-    overlap = _overlap(sweep, patch, fit)
+    overlap = _overlap(sweep, patch, seen, fit.T_lidar_board)
     if overlap < _LEAST_OVERLAP:
-        return _refused(
-            sweep, patch, f"only {overlap:.0%} of it and of the board that fits best are the same rays"
-        )
-    if settings.reflectance == "require" and not fit.seen.squares:
-        return _refused(sweep, patch, f"no squares in its reflectance (correlation {fit.contrast:.2f})")
+        return _apart(sweep, patch, overlap)
+    if not fit.seen.squares:
+        if settings.reflectance == "require":
+            return _refused(sweep, patch, "no squares in its reflectance")
+        if not seen_sides(rectangle, board).all():
+            return _refused(
+                sweep, patch, "no squares in its reflectance, and only one of its sides can be measured"
+            )
     return _cloud_board(sweep, patch, rectangle, fit, overlap)
+
+
+def _apart(sweep: Sweep, patch: Patch, overlap: float) -> Refused:
+    return _refused(
+        sweep, patch, f"it and the board that fits it best have only {overlap:.0%} of their rays in common"
+    )
 
 
 def _size(pair: object) -> str:
@@ -124,20 +138,15 @@ def _start(patch: Patch, rectangle: Rectangle, board: Board, turned: int) -> F8:
 
 def _best(seen: Seen, starts: list[F8], settings: CloudSettings) -> PoseFit:
     """The best of the fits from all starts: by edges first, then with the squares where they can be seen."""
-    plain = min((fitted(seen, T) for T in starts), key=lambda fit: fit.cost)
-    if settings.reflectance == "ignore" or np.ptp(seen.intensity) <= 0:
-        return plain
-    options = []
-    for T in starts:
-        by_edges = fitted(seen, T)
-        for first_dark in (True, False):
-            squares = with_squares(seen, first_dark)
-            shift = _shifted(squares, by_edges)
-            options.append((contrast_of(squares, shift), squares, shift))
-    contrast, squares, T = max(options, key=lambda option: option[0])
-    if contrast < _LEAST_CONTRAST:
-        return plain
-    return fitted(squares, T)
+    rough = [fitted(seen, T, rounds=2) for T in starts]
+    if settings.reflectance != "ignore" and np.ptp(seen.intensity) > 0:
+        options = []
+        for squares in (with_squares(seen, True), with_squares(seen, False)):
+            options += [(squares, _shifted(squares, fit)) for fit in rough]
+        squares, T = max(options, key=lambda option: contrast_of(*option))
+        if contrast_of(squares, T) > _LEAST_CONTRAST:
+            return fitted(squares, T)
+    return fitted(seen, min(rough, key=lambda fit: fit.cost).T_lidar_board)
 
 
 def _shifted(seen: Seen, fit: PoseFit) -> F8:
@@ -158,14 +167,14 @@ def _shifted(seen: Seen, fit: PoseFit) -> F8:
     return best
 
 
-def _overlap(sweep: Sweep, patch: Patch, fit: PoseFit) -> float:
+def _overlap(sweep: Sweep, patch: Patch, seen: Seen, T: F8) -> float:
     """Rays both on the piece and on the board, over those on either; those near the outline and hidden ones apart."""
     directions = sweep.direction[patch.window]
-    ahead = directions @ fit.T_lidar_board[:3, 2] < -0.02
-    off = np.where(ahead, outside(fit.seen, fit.T_lidar_board, directions), np.inf)
+    ahead = directions @ T[:3, 2] < -0.02
+    off = np.where(ahead, outside(seen, T, directions, 0.0), np.inf)
     slope = np.minimum(directions @ patch.normal, -1e-3)
     hidden = sweep.range_m[patch.window] < -patch.distance_m / slope - 2 * patch.tolerance_m
-    margin = 0.02 + fit.seen.width_m
+    margin = 0.02 + seen.width_m
     within, beyond = (off < -margin) & ~hidden, off > margin
     both = (within & patch.inside).sum()
     either = within.sum() + (beyond & patch.inside).sum()
@@ -195,9 +204,12 @@ def _cloud_board(
         covariance=fit.covariance,
         extent_m=_extent(rectangle, board, T, patch),
         rmse_m=fit.rmse_m,
-        beam_sigma_m=0.0,
+        beam_sigma_m=fit.beam_sigma_m,
+        evidence=fit.evidence,
         darker_m=fit.darker_m,
         flare_m=fit.flare_m,
+        crossing_m=fit.crossing_m,
+        farther_m=fit.farther_m,
         corners_m=transform(T, corners),
         corner_covariance=slopes @ fit.covariance @ np.swapaxes(slopes, 1, 2),
         first_dark=seen.first_dark if seen.squares else None,
@@ -218,7 +230,7 @@ def _edge_columns(edges: Edges, seen: Seen, T: F8) -> tuple[F8, F8, I8, F8]:
     distance = np.column_stack(
         (-flat[:, 1] - half[1], flat[:, 0] - half[0], flat[:, 1] - half[1], -flat[:, 0] - half[0])
     )
-    on, off = (outside(seen, T, d[along]) for d in (edges.on, edges.off))
+    on, off = (outside(seen, T, d[along], 0.0) for d in (edges.on, edges.off))
     return points, middle, np.argmax(distance, axis=1), np.sqrt((off - on) ** 2 / 12 + 0.003**2)
 
 
@@ -230,13 +242,19 @@ def _extent(rectangle: Rectangle, board: Board, T: F8, patch: Patch) -> tuple[fl
     return (float(size[0]), float(size[1])) if along else (float(size[1]), float(size[0]))
 
 
-def _distinct(found: list[CloudBoard], board: Board) -> list[CloudBoard]:
-    """The best of those in the same place, in the order of quality."""
+def _distinct(found: list[CloudBoard], board: Board) -> tuple[list[CloudBoard], list[Refused]]:
+    """The best of those in the same place, in the order of quality; without squares only where none has them."""
     out: list[CloudBoard] = []
+    refused: list[Refused] = []
+    squares = any(one.first_dark is not None for one in found)
     for one in sorted(found, key=lambda b: -b.quality):
-        if all(
-            np.linalg.norm(one.T_lidar_board[:3, 3] - b.T_lidar_board[:3, 3]) > min(board.board_m) / 2
-            for b in out
-        ):
-            out.append(one)
-    return out
+        centre = one.T_lidar_board[:3, 3]
+        if any(np.linalg.norm(centre - b.T_lidar_board[:3, 3]) < min(board.board_m) / 2 for b in out):
+            continue
+        if squares and one.first_dark is None:
+            refused.append(
+                Refused(centre, len(one.points_m), "no squares in its reflectance, unlike in that of another")
+            )
+            continue
+        out.append(one)
+    return out, refused

@@ -31,6 +31,8 @@ class Sweep:
     intensity: F8
     beam: I8
     """0 is the lowest."""
+    name: I8
+    """(beams,) what the sensor calls each: its ring, or without rings its elevation in tenths of a degree."""
     azimuth: F8
     """rad, from -pi to pi + 2, growing to the left."""
     foreground: B1
@@ -64,7 +66,7 @@ def sweep_of(points: F8, intensity: F8, beam: I8 | None, foreground: B1, nearest
         distance = np.linalg.norm(points, axis=1)
     good = np.flatnonzero(np.isfinite(distance) & (distance > nearest_m))
     x, r = points[good], distance[good]
-    rows = _by_elevation(x) if beam is None else _ranked(x, r, beam[good])
+    rows, names = _by_elevation(x, r) if beam is None else _ranked(x, r, beam[good])
     azimuth = np.arctan2(x[:, 1], x[:, 0])
     again = np.flatnonzero(azimuth < -np.pi + _AGAIN_RAD)
     pick = np.concatenate((np.arange(len(good)), again))
@@ -80,6 +82,7 @@ def sweep_of(points: F8, intensity: F8, beam: I8 | None, foreground: B1, nearest
         range_m=r[pick],
         intensity=light[good][pick].astype(np.float64),
         beam=beams,
+        name=names,
         azimuth=wide,
         foreground=foreground[good][pick],
         step_rad=_steps(wide, first),
@@ -88,24 +91,26 @@ def sweep_of(points: F8, intensity: F8, beam: I8 | None, foreground: B1, nearest
     )
 
 
-def _ranked(x: F8, r: F8, beam: I8) -> I8:
-    """Beams numbered by their middle elevation."""
+def _ranked(x: F8, r: F8, beam: I8) -> tuple[I8, I8]:
+    """Beams (n,) numbered by their middle elevation, and their names."""
     names, number = np.unique(beam, return_inverse=True)
     order = np.argsort(number, kind="stable")
     ends = np.cumsum(np.bincount(number, minlength=len(names)))[:-1]
     middle = [np.median(part) for part in np.split((x[:, 2] / r)[order], ends)]
+    upwards = np.argsort(middle, kind="stable")
     rank = np.empty(len(names), np.int64)
-    rank[np.argsort(middle, kind="stable")] = np.arange(len(names))
-    return rank[number]
+    rank[upwards] = np.arange(len(names))
+    return rank[number], names[upwards].astype(np.int64)
 
 
-def _by_elevation(x: F8) -> I8:
+def _by_elevation(x: F8, r: F8) -> tuple[I8, I8]:
     east, north, up = (np.ascontiguousarray(x[:, k], np.float32) for k in range(3))
     everything = np.ones(len(x), np.bool_)
     image = range_image(ImageSettings(rows=_MOST_ROWS), east, north, up, everything, everything)
     columns = round(2 * np.pi / image.column_rad)
-    _, rows = np.unique(image.cell // columns, return_inverse=True)
-    return rows.astype(np.int64)
+    rows, names = _ranked(x, r, (image.cell // columns).astype(np.int64))
+    middle = np.degrees(image.elevation_rad[names])
+    return rows, np.round(10 * middle).astype(np.int64)
 
 
 def _steps(azimuth: F8, first: I8) -> F8:
