@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from scanloom.schemas.cameras import CameraModel
 from scanloom.stages.calibrate.board import Board
+from scanloom.stages.calibrate.cloud.evidence import SENSOR
 from scanloom.stages.calibrate.image import ImageBoard
 from scanloom.stages.calibrate.rays import Bearings, board_pose
 from scanloom.stages.calibrate.scene import Placement, Scene
@@ -108,9 +109,7 @@ def photograph(
     fit = board_pose(Bearings.of(lens, pixels), corners)
     if fit is None:
         return None
-    board = ImageBoard(
-        np.arange(len(corners)), pixels, world.board.ambiguity, fit.rms_px, fit.T_camera_board
-    )
+    board = ImageBoard(np.arange(len(corners)), pixels, world.board.ambiguity, fit.rms_px, fit.T_camera_board)
     return board.turned(world.board, int(rng.integers(world.board.ambiguity)))
 
 
@@ -120,7 +119,10 @@ def scan(world: World, offsets: F8, T_lidar_board: F8, rng: np.random.Generator)
     x, reach = _met(T_lidar_board, directions)
     low, high = world.board.outline_m()[0, :2], world.board.outline_m()[2, :2]
     on = ((x > low) & (x < high)).all(axis=1)
-    plane = directions[on] * (reach[on] + offsets[row[on]] + rng.normal(0, world.range_sigma_m, on.sum()))[:, None]
+    plane = (
+        directions[on]
+        * (reach[on] + offsets[row[on]] + rng.normal(0, world.range_sigma_m, on.sum()))[:, None]
+    )
     changes = np.flatnonzero((on[1:] != on[:-1]) & (row[1:] == row[:-1]))
     if len(plane) < 50 or len(changes) < 8:
         return None
@@ -146,7 +148,9 @@ class _Edges:
         normals = np.array([(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)])[side]
         offsets = np.array([-low[0], high[0], -low[1], high[1]])[side]
         across = np.abs((normals * (off - on)).sum(axis=1))
-        return cls(directions[at] + directions[at + 1], normals, offsets, np.maximum(across / np.sqrt(12), 1e-3))
+        return cls(
+            directions[at] + directions[at + 1], normals, offsets, np.maximum(across / np.sqrt(12), 1e-3)
+        )
 
 
 def _view(world: World, T_start: F8, plane: F8, row: NDArray[np.int64], edges: _Edges) -> LidarView:
@@ -157,7 +161,9 @@ def _view(world: World, T_start: F8, plane: F8, row: NDArray[np.int64], edges: _
         normal, middle = T[:3, 2], T[:3, 3]
         reach = np.linalg.norm(plane, axis=1)
         expected = (normal @ middle) / (plane / reach[:, None] @ normal)
-        x = (edges.directions * ((normal @ middle) / (edges.directions @ normal))[:, None] - middle) @ T[:3, :2]
+        x = (edges.directions * ((normal @ middle) / (edges.directions @ normal))[:, None] - middle) @ T[
+            :3, :2
+        ]
         off = ((edges.normals * x).sum(axis=1) - edges.offsets_m) / edges.sigma_m
         return np.concatenate(((reach - expected) / world.range_sigma_m, off))
 
@@ -169,11 +175,12 @@ def _view(world: World, T_start: F8, plane: F8, row: NDArray[np.int64], edges: _
     for _ in range(5):
         J = slopes(T)
         T = moved(T, -np.linalg.solve(J.T @ J, J.T @ rows(T)))
-    by_sensor = np.zeros((len(plane) + len(edges.sigma_m), 2 + len(beams)))
-    by_sensor[np.arange(len(plane)), 2 + beam] = -1.0 / world.range_sigma_m
+    by_sensor = np.zeros((len(plane) + len(edges.sigma_m), len(SENSOR) + len(beams)))
+    by_sensor[np.arange(len(plane)), len(SENSOR) + beam] = -1.0 / world.range_sigma_m
+    by_sensor[: len(plane), SENSOR.index("farther_m")] = -1.0 / world.range_sigma_m
     by_sensor[len(plane) :, 0] = -1.0 / edges.sigma_m
     triangle = np.linalg.qr(np.column_stack((slopes(T), by_sensor, rows(T))), mode="r")
-    return LidarView.of(T, beams, triangle[:-1, :-1], triangle[:-1, -1], len(plane), len(edges.sigma_m))
+    return LidarView(T, beams, triangle[:-1, :-1], triangle[:-1, -1], len(plane), len(edges.sigma_m))
 
 
 def _rays_towards(world: World, T_lidar_board: F8) -> tuple[F8, F8]:

@@ -34,12 +34,15 @@ class Certainty(_Entry):
     """Which placement would help most, in words."""
     placements: int
     """Placements in use that this camera saw."""
-    reprojection_px: float
-    """Root mean square of the corners in use, with the boards where the graph has them."""
+    residual_px: float
+    """Root mean square distance of the corners from the LiDAR's boards, by the calibration of all placements."""
     leave_one_out_px: float
-    """Root mean square distance of the corners from the LiDAR's board projected by a calibration without it."""
+    """The same, each placement by a calibration without it; what the LiDAR is off by is corrected."""
     leave_one_out_cm: float
     """The same on the board's plane: from each corner's ray to the LiDAR's corner."""
+    leave_one_out_as_read_px: float
+    """With boards where their clouds alone have them: what points straight from the sensor meet."""
+    leave_one_out_as_read_cm: float
 
 
 class Sighting(_Entry):
@@ -86,6 +89,9 @@ class Repeatability(_Entry):
     translation_max_m: float
     rotation_rms_deg: float
     translation_rms_m: float
+    held_out_px: float | None = None
+    """Root mean square over the placements that a half did not hold."""
+    held_out_cm: float | None = None
 
 
 class Calibration(Document):

@@ -54,6 +54,13 @@ class Mode(StrEnum):
     SOFT = "soft"
 
 
+class Method(StrEnum):
+    """How cameras are calibrated."""
+
+    BOARD = "board"
+    PAPER = "paper"
+
+
 class Heights(StrEnum):
     """What the heights of an export are counted from."""
 
@@ -337,6 +344,39 @@ def inspect(
     else:
         print(text_of(found))
     raise typer.Exit(exit_code_of(found))
+
+
+@app.command("calibrate")
+def calibrate_command(
+    session: Annotated[
+        Path,
+        typer.Argument(help="Folder with clouds/, images/, camera_info.yaml (or camera_info/) and board.yaml."),
+    ],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the calibration and its pictures.")],
+    board: Annotated[
+        Path | None, typer.Option("--board", help="The board's file (default board.yaml of the session).")
+    ] = None,
+    method: Annotated[
+        Method | None,
+        typer.Option("--method", help="board: a pose per board; paper: free corner points, for comparison."),
+    ] = None,
+    settings: SetOption = None,
+    pictures: Annotated[bool, typer.Option(help="Draw a picture per placement.")] = True,
+    as_json: JsonOption = False,
+) -> None:
+    """Cameras to a LiDAR from a chessboard shown in a few places."""
+    from scanloom.workflows.calibrate_rig import Order, calibrate_rig, settings_of, text_of
+    from scanloom.workflows.configuration import command_line_settings
+
+    overrides = command_line_settings(settings or [])
+    if method is not None:
+        overrides.setdefault("calibrate", {})["method"] = method.value
+    chosen, cloud = settings_of(overrides)
+    outcome = calibrate_rig(Order(session, out, board, chosen, cloud, pictures))
+    if as_json:
+        _emit(outcome.as_json())
+    else:
+        print(text_of(outcome))
 
 
 @app.command()

@@ -36,6 +36,8 @@ class Found:
 
     scene: Scene
     """What is in use, corners in the right order."""
+    everything: Scene
+    """With what was left out."""
     estimate: Estimate
     noise: Noise
     pairs: list[Pair]
@@ -52,6 +54,7 @@ def calibrate(scene: Scene, settings: CalibrateSettings, given: Mapping[str, F8]
     InvalidInput : fewer than three placements, lenses or images of two cameras swapped, a board of another size, or
         clouds and images that do not show the same boards.
     """
+    everything = scene
     check_count(scene)
     check_lenses(scene)
     left_out = blurred(scene, settings.scatter_px)
@@ -73,6 +76,7 @@ def calibrate(scene: Scene, settings: CalibrateSettings, given: Mapping[str, F8]
     check_mounting(estimate.T_lidar_camera, given or {})
     return Found(
         scene,
+        everything,
         estimate,
         noise,
         pairs_of(scene, noise, estimate.sensor),
@@ -91,13 +95,12 @@ def _begin(
 
 
 def _noise(settings: CalibrateSettings) -> Noise:
-    return Noise(
+    noise = Noise(
         corner_least_px=settings.corner_least_px,
-        apart_m=settings.apart_m,
-        range_offset_m=settings.beam_offset_m,
         beam_offset_m=settings.beam_offset_m,
         lens_share=settings.lens_share,
     )
+    return noise if settings.lidar == "estimated" else noise.believing()
 
 
 def _familiar(first: Start, settings: CalibrateSettings) -> tuple[Scene, dict[tuple[str, str], str]]:

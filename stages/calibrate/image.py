@@ -87,12 +87,19 @@ def grey(data: bytes) -> U1 | None:
     return None if image is None else np.asarray(image, np.uint8)
 
 
-def pattern_seen(image: U1, sizes: list[tuple[int, int]]) -> tuple[int, int] | None:
-    """Which of other pattern sizes the image shows; for the message when the expected one is not there."""
-    for size in sizes:
-        if _detected(_reduced(image)[0], size) is not None:
-            return size
+def pattern_seen(image: U1) -> tuple[int, int] | None:
+    """Inner corners of whatever chessboard the image shows, the longer side first; for the message when the expected one
+    is not there."""
+    small, _ = _reduced(image)
+    for size in _PROBES:
+        found = _sector(small, size)
+        if found is not None:
+            n, m = found.shape[:2]
+            return max(m, n), min(m, n)
     return None
+
+
+_PROBES = ((5, 4), (4, 4), (4, 3), (3, 3))
 
 
 # --- plain patterns --------------------------------------------------------------------------------------------------
@@ -126,16 +133,28 @@ def _reduced(image: U1) -> tuple[U1, float]:
 
 
 def _detected(image: U1, size: tuple[int, int]) -> F8 | None:
-    """Corners (m*n, 2), the first dimension running fastest."""
+    """Corners (m*n, 2), the first dimension running fastest; None where there is no board, or a larger one."""
     import cv2
 
-    found, corners = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
-    if not found:
-        flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-        found, corners = cv2.findChessboardCorners(image, size, flags=flags)
+    grid = _sector(image, size)
+    if grid is not None:
+        return grid.reshape(-1, 2) if grid.shape[:2] == size[::-1] else None
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+    found, corners = cv2.findChessboardCorners(image, size, flags=flags)
     if not found or corners is None or corners.size != 2 * size[0] * size[1]:
         return None
     return np.asarray(corners, np.float64).reshape(-1, 2)
+
+
+def _sector(image: U1, size: tuple[int, int]) -> F8 | None:
+    """Corners (rows, columns, 2) of a pattern of at least this size: part of a larger one is not taken for it."""
+    import cv2
+
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+    found, corners, meta = cv2.findChessboardCornersSBWithMeta(image, size, flags)
+    if not found or meta is None:
+        return None
+    return np.asarray(corners, np.float64).reshape(*meta.shape[:2], 2)
 
 
 def _refined(image: U1, grid: F8) -> F8:

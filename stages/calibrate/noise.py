@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from scanloom.stages.calibrate.cloud.pose import SENSOR_SIGMA_M
 from scanloom.stages.geometry.se3 import F8
 
 
@@ -20,17 +21,10 @@ class Noise:
     plane and along its normal, m."""
     beam_m: float = 0.003
     """By how much a beam's offset changes from placement to placement."""
-    apart_m: float = 0.01
-    """By how much all boards may stand nearer by the clouds than by the images: ranges that are all too short, a focal
-    length or a lens that is a little off, a print that is not quite to scale."""
-    range_offset_m: float = 0.01
-    """By how much the LiDAR may read all ranges too long, as its own view of the squares tells."""
     beam_offset_m: float = 0.01
-    """By how much each beam may differ from that."""
-    larger_m: float = 0.008
-    """By how much a board may look larger on each side: beams have a width."""
-    darker_m: float = 0.015
-    """By how much farther dark print may read than bright print."""
+    """By how much each beam's ranges may differ from the others'."""
+    sensor_m: tuple[float, ...] = tuple(float(v) for v in SENSOR_SIGMA_M)
+    """How far off the sensor may be in what all its clouds share, in the order of `SENSOR`."""
     softness: float = 3.0
     """Corners beyond so many standard deviations count linearly (Huber)."""
     lens_share: float = 0.0
@@ -41,6 +35,10 @@ class Noise:
         """(6,) in the order of a tangent of the board."""
         tilt, spin, plane, normal = self.bias
         return np.array([tilt, tilt, spin, plane, plane, normal])
+
+    def believing(self) -> Noise:
+        """The same with a LiDAR that is off in nothing, as most tools take it."""
+        return replace(self, beam_offset_m=0.0, sensor_m=(0.0,) * len(self.sensor_m))
 
     def with_bias(self, bias: tuple[float, float, float, float], beam_m: float) -> Noise:
         """With the larger of these and the least ones of the defaults."""

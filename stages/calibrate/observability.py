@@ -32,12 +32,12 @@ class Weakness:
     advice: str
 
 
-def weakness(covariance: F8, camera: CameraModel, board: Board, found: Sequence[Pair], bias: F8) -> Weakness:
+def weakness(covariance: F8, camera: CameraModel, board: Board, found: Sequence[Pair]) -> Weakness:
     """The weakest direction of a covariance (6, 6), and the best of many imagined placements.
 
     A placement is judged by what it leaves of the weakest direction, with a board as certain as those there are.
     """
-    return Weakness(_direction(covariance), _advice(covariance, camera, board, found, bias))
+    return Weakness(_direction(covariance), _advice(covariance, camera, board, found))
 
 
 def _scaled(covariance: F8) -> F8:
@@ -61,8 +61,8 @@ def _direction(covariance: F8) -> str:
     return " together with ".join(words)
 
 
-def _advice(covariance: F8, camera: CameraModel, board: Board, found: Sequence[Pair], bias: F8) -> str:
-    usual = np.mean([pair.covariance for pair in found], axis=0) + np.diag(bias**2)
+def _advice(covariance: F8, camera: CameraModel, board: Board, found: Sequence[Pair]) -> str:
+    usual = np.mean([pair.covariance for pair in found], axis=0)
     known = np.linalg.inv(covariance)
     near = float(np.median([np.linalg.norm(pair.T_camera_board[:3, 3]) for pair in found]))
     best, words = np.inf, ""

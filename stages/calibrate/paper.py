@@ -78,9 +78,7 @@ def _estimate(scene: Scene, poses: dict[str, F8]) -> Estimate:
         )
         blocks[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = np.linalg.inv(J.T @ J) * _CLOUD_SIGMA_M**2
     boards = {p.name: p.cloud.T_lidar_board for p in scene.placements}
-    believed = Sensor.unknown(
-        scene.beams, Noise(apart_m=0.0, range_offset_m=0.0, beam_offset_m=0.0, larger_m=1e-6, darker_m=1e-6)
-    )
+    believed = Sensor.unknown(scene.beams, Noise().believing())
     return Estimate(poses, boards, believed, dict(scene.models), blocks, 1.0, {})
 
 

@@ -40,9 +40,7 @@ class Scene:
     """Names of the LiDAR's beams on any board, sorted; a part of a scene keeps those of all of it."""
 
     @classmethod
-    def of(
-        cls, board: Board, models: Mapping[str, CameraModel], placements: tuple[Placement, ...]
-    ) -> Scene:
+    def of(cls, board: Board, models: Mapping[str, CameraModel], placements: tuple[Placement, ...]) -> Scene:
         """A scene of all there is."""
         return cls(board, models, placements, all_beams([p.cloud for p in placements]))
 

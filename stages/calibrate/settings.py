@@ -23,14 +23,15 @@ class CalibrateSettings(BaseModel):
     corner_least_px: float = Field(
         0.1, ge=0.01, le=5.0, description="corners are never believed better than this, one sigma, px"
     )
-    apart_m: float = Field(
+    lidar: Literal["estimated", "believed"] = Field(
+        "estimated",
+        description="estimated: what all clouds of the sensor are off by is found along; believed: it is off in nothing",
+    )
+    beam_offset_m: float = Field(
         0.01,
         ge=0.0,
         le=0.1,
-        description="by how much all boards may stand nearer by the clouds than by the images, one sigma, m; 0 believes both",
-    )
-    beam_offset_m: float = Field(
-        0.01, ge=0.0, le=0.1, description="by how much each beam's ranges may be off, one sigma, m; 0 believes them"
+        description="by how much each beam's ranges may be off, one sigma, m; 0 believes them",
     )
     lens_share: float = Field(
         0.0,

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from scanloom.stages.calibrate.cloud.evidence import SENSOR
 from scanloom.stages.calibrate.factors import cloud_rows
 from scanloom.stages.calibrate.noise import Noise
 from scanloom.stages.geometry.se3 import F8, so3_exp
 
 I8 = NDArray[np.int64]
-SHARED = 3
-"""Unknowns of the sensor before its beams: by how much boards look larger, dark print reads farther, and all boards
-stand nearer to the LiDAR than the images have them."""
+SHARED = len(SENSOR)
+"""Unknowns of the sensor before its beams."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class LidarView:
     """The board in one cloud: ranges along their rays, edges and squares as one linear system.
 
     |root (xi, sensor) + gap|^2 is their sum of squares near `T_lidar_board`, in units of their noise; xi is turn and shift
-    (6,) of the board in its frame, sensor is (larger, darker, apart, offsets of `beams`), m.
+    (6,) of the board in its frame, sensor is (those of `SENSOR`, offsets of `beams`), m.
     """
 
     T_lidar_board: F8
@@ -33,18 +33,10 @@ class LidarView:
     points: int = 0
     edge_points: int = 0
 
-    @classmethod
-    def of(cls, T_lidar_board: F8, beams: I8, root: F8, gap: F8, points: int, edge_points: int) -> LidarView:
-        """From rows (p, 6 + 2 + k) without the column `apart`: a shift along the line of sight, towards the LiDAR."""
-        towards = -T_lidar_board[:3, :3].T @ T_lidar_board[:3, 3] / np.linalg.norm(T_lidar_board[:3, 3])
-        apart = (root[:, 3:6] @ towards)[:, None]
-        columns = np.concatenate((root[:, :8], apart, root[:, 8:]), axis=1)
-        return cls(T_lidar_board, beams, columns, gap, points, edge_points)
-
 
 @dataclass(frozen=True)
 class Sensor:
-    """What is known of the LiDAR: (larger, darker, apart, offset of each beam), m, and how well."""
+    """What is known of the LiDAR: (those of `SENSOR`, offset of each beam), m, and how well."""
 
     beams: I8
     mean: F8
@@ -52,27 +44,23 @@ class Sensor:
 
     @classmethod
     def unknown(cls, beams: I8, noise: Noise) -> Sensor:
-        """Before anything was seen: beams are off together and each for itself."""
+        """Before anything was seen."""
         size = SHARED + len(beams)
-        covariance = np.zeros((size, size))
-        covariance[0, 0], covariance[1, 1] = noise.larger_m**2, noise.darker_m**2
-        covariance[2, 2] = noise.apart_m**2 + 1e-12
-        offsets = noise.range_offset_m**2 + noise.beam_offset_m**2 * np.eye(len(beams))
-        covariance[SHARED:, SHARED:] = offsets + 1e-12 * np.eye(len(beams))
+        sigma = np.r_[noise.sensor_m, np.full(len(beams), noise.beam_offset_m)]
+        covariance = np.diag(sigma**2 + _NEVER_ZERO)
         return cls(beams, np.zeros(size), covariance)
 
     def columns(self, view: LidarView) -> I8:
         """Where the sensor's unknowns of a view stand among all."""
         return np.concatenate((np.arange(SHARED), SHARED + np.searchsorted(self.beams, view.beams)))
 
-    @property
-    def apart_m(self) -> float:
-        """How much nearer the clouds have the boards than the images."""
-        return float(self.mean[2])
+    def known(self, name: str) -> tuple[float, float]:
+        """One of `SENSOR`, m, and its standard deviation."""
+        i = SENSOR.index(name)
+        return float(self.mean[i]), float(np.sqrt(self.covariance[i, i]))
 
-    @property
-    def apart_sigma_m(self) -> float:
-        return float(np.sqrt(self.covariance[2, 2]))
+
+_NEVER_ZERO = 1e-12
 
 
 def all_beams(views: Sequence[LidarView]) -> I8:
