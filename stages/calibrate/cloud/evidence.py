@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanloom.stages.calibrate.cloud.sweep import I8
-from scanloom.stages.geometry.se3 import F8, inverse, se3_log
+from scanloom.stages.geometry.se3 import F8
 
 SENSOR = ("flare_m", "darker_m", "crossing_m", "farther_m")
 """Unknowns of the sensor that come first; then one error of range for each beam."""
@@ -34,17 +34,9 @@ class Evidence:
     gap: F8
     """(p,)."""
 
-    def rows(self, T_lidar_board: F8, sensor: F8) -> tuple[F8, F8]:
-        """Errors (p,) in units of their noise for a pose and the sensor's unknowns (4 + k,), and derivatives (p, 10 + k).
-
-        The derivatives by the pose are those at `T_lidar_board` of the evidence: good to second order in the distance.
-        """
-        xi = se3_log(inverse(self.T_lidar_board) @ T_lidar_board)
-        return np.asarray(self.root @ np.concatenate((xi, sensor)) + self.gap, np.float64), self.root
-
 
 def evidence_of(T_lidar_board: F8, beams: I8, slopes: F8, errors: F8) -> Evidence:
     """From whitened errors (n,) and their derivatives (n, 10 + k) at a pose and zero errors of the sensor."""
-    triangle = np.linalg.qr(np.column_stack((slopes, errors)), mode="r")
+    triangle = np.asarray(np.linalg.qr(np.column_stack((slopes, errors)), mode="r"), np.float64)
     width = slopes.shape[1]
     return Evidence(T_lidar_board, beams, triangle[:width, :width], triangle[:width, width])

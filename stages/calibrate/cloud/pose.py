@@ -323,6 +323,12 @@ def with_squares(seen: Seen, first_dark: bool) -> Seen:
     return replace(seen, squares=True, first_dark=first_dark)
 
 
-def contrast_of(seen: Seen, T: F8) -> float:
-    """Correlation of the reflectance with the print at a pose."""
-    return _contrast(seen, T, 0.0)
+def agreement(seen: Seen, T: F8) -> float:
+    """How well edges and squares agree with a pose: minus their cost, the scatter of the reflectance taken from itself."""
+    sensor = np.zeros(len(SENSOR_SIGMA_M))
+    contrast = min(max(_contrast(seen, T, 0.0), 0.0), 0.99)
+    edges = _other_errors(
+        replace(seen, squares=False), T, sensor, _scales(replace(seen, squares=False), T, sensor)
+    )
+    by_edges = 0.5 * _OUTLIER**2 * np.log1p((edges / _OUTLIER) ** 2).sum()
+    return float(-len(seen.beam) / (2 * _ALIKE**2) * np.log1p(-(contrast**2)) - by_edges)

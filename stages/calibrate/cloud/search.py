@@ -13,7 +13,7 @@ from scanloom.stages.calibrate.cloud.patches import Patch, patches
 from scanloom.stages.calibrate.cloud.pose import (
     PoseFit,
     Seen,
-    contrast_of,
+    agreement,
     fitted,
     outside,
     seen_of,
@@ -29,7 +29,10 @@ _LEAST_OVERLAP = 0.75
 """Rays that are on both piece and board, of those on either."""
 _ROUGH_OVERLAP = 0.6
 """The same before the fit."""
-_SHIFTS = np.linspace(-1.0, 1.0, 9)
+_NEAR = 0.1
+"""Distance of an edge from the board's outline that counts as near, as a share of its shorter side."""
+_NEAR_SHARE = 0.75
+_SHIFTS = np.linspace(-1.25, 1.25, 11)
 """Squares by which starts are shifted where the edges leave the place open."""
 
 
@@ -87,12 +90,16 @@ def _judged(sweep: Sweep, patch: Patch, board: Board, settings: CloudSettings) -
     rectangle = measured(patch, edges)
     if rectangle is None:
         return _refused(sweep, patch, "too few of its edges can be seen")
-    ways = fits(rectangle, board, settings.extent_share)
-    if not any(ways):
-        size, wanted = (_size(value) for value in (rectangle.size, board.board_m))
-        return _refused(sweep, patch, f"measures {size}, the board {wanted}")
     seen = seen_of(sweep, patch, edges, board, settings)
+    ways = fits(rectangle, board, settings.extent_share)
     starts = [_start(patch, rectangle, board, turned) for turned, fit in enumerate(ways) if fit]
+    if not starts:
+        clear = _without_hands(patch, edges, rectangle, seen, settings)
+        if clear is None:
+            size, wanted = (_size(value) for value in (rectangle.size, board.board_m))
+            return _refused(sweep, patch, f"measures {size}, the board {wanted}")
+        rectangle, T = clear
+        starts = [T]
     overlap = max(_overlap(sweep, patch, seen, T) for T in starts)
     if overlap < _ROUGH_OVERLAP:
         return _apart(sweep, patch, overlap)
@@ -108,6 +115,30 @@ def _judged(sweep: Sweep, patch: Patch, board: Board, settings: CloudSettings) -
                 sweep, patch, "no squares in its reflectance, and only one of its sides can be measured"
             )
     return _cloud_board(sweep, patch, rectangle, fit, overlap)
+
+
+def _without_hands(
+    patch: Patch, edges: Edges, rectangle: Rectangle, seen: Seen, settings: CloudSettings
+) -> tuple[Rectangle, F8] | None:
+    """A measure by the edges near a board of the known size: hands and what else is flush with it spoil the others.
+
+    None where less than three quarters of the edges are near, or the measure still does not fit.
+    """
+    rough = [fitted(seen, _start(patch, rectangle, seen.board, turned), rounds=2) for turned in (0, 1)]
+    T = min(rough, key=lambda fit: fit.cost).T_lidar_board
+    middle = edges.on + edges.off
+    middle = middle / np.linalg.norm(middle, axis=1)[:, None]
+    near = np.abs(outside(seen, T, middle, 0.0)) < _NEAR * min(seen.board.board_m)
+    along = ~edges.across
+    if (near & along).sum() < _NEAR_SHARE * along.sum():
+        return None
+    better = measured(
+        patch,
+        Edges(edges.on[near], edges.off[near], edges.left[near], edges.across[near], edges.weight[near]),
+    )
+    if better is None or not any(fits(better, seen.board, settings.extent_share)):
+        return None
+    return better, T
 
 
 def _apart(sweep: Sweep, patch: Patch, overlap: float) -> Refused:
@@ -140,31 +171,25 @@ def _best(seen: Seen, starts: list[F8], settings: CloudSettings) -> PoseFit:
     """The best of the fits from all starts: by edges first, then with the squares where they can be seen."""
     rough = [fitted(seen, T, rounds=2) for T in starts]
     if settings.reflectance != "ignore" and np.ptp(seen.intensity) > 0:
-        options = []
-        for squares in (with_squares(seen, True), with_squares(seen, False)):
-            options += [(squares, _shifted(squares, fit)) for fit in rough]
-        squares, T = max(options, key=lambda option: contrast_of(*option))
-        if contrast_of(squares, T) > _LEAST_CONTRAST:
-            return fitted(squares, T)
+        options = [
+            (squares, T)
+            for squares in (with_squares(seen, True), with_squares(seen, False))
+            for fit in rough
+            for T in _shifted(squares, fit)
+        ]
+        squares, T = max(options, key=lambda option: agreement(*option))
+        fit = fitted(squares, T)
+        if fit.contrast > _LEAST_CONTRAST:
+            return fit
     return fitted(seen, min(rough, key=lambda fit: fit.cost).T_lidar_board)
 
 
-def _shifted(seen: Seen, fit: PoseFit) -> F8:
-    """The start moved within the plane to where the squares agree best, as far as the edges allow."""
-    T = fit.T_lidar_board
-    best, best_score = T, contrast_of(seen, T)
+def _shifted(seen: Seen, fit: PoseFit) -> list[F8]:
+    """The start, and others around it within the plane as far as the edges allow."""
+    T, size = fit.T_lidar_board, seen.board.square_m
     sigma = np.sqrt(np.diag(fit.covariance)[3:5])
-    steps = [
-        _SHIFTS[np.abs(_SHIFTS) * seen.board.square_m < max(3 * s, 0.3 * seen.board.square_m)] for s in sigma
-    ]
-    for x in steps[0]:
-        for y in steps[1]:
-            moved = T.copy()
-            moved[:3, 3] += T[:3, :2] @ (np.array([x, y]) * seen.board.square_m)
-            score = contrast_of(seen, moved)
-            if score > best_score:
-                best, best_score = moved, score
-    return best
+    x, y = (_SHIFTS[np.abs(_SHIFTS) * size <= max(4 * s, 0.3 * size)] for s in sigma)
+    return [T @ pose(np.eye(3), [i * size, j * size, 0.0]) for i in x for j in y]
 
 
 def _overlap(sweep: Sweep, patch: Patch, seen: Seen, T: F8) -> float:
