@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -38,6 +39,10 @@ class World:
     distance_m: tuple[float, float] = (2.0, 4.0)
     board: Board = field(default_factory=lambda: BOARD)
 
+    def heading(self, camera: int) -> float:
+        """Where a camera looks, rad from the LiDAR's x."""
+        return float(np.radians(40.0) * (camera - (self.cameras - 1) / 2))
+
 
 def model(lens: int) -> CameraModel:
     """Three lenses in turn: radial-tangential, equidistant, pinhole."""
@@ -57,7 +62,7 @@ def rig(world: World, rng: np.random.Generator) -> tuple[dict[str, CameraModel],
     """Cameras 40 degrees apart, each mounted with an error of some degrees and centimetres."""
     models, poses = {}, {}
     for i in range(world.cameras):
-        heading = np.radians(40.0) * (i - (world.cameras - 1) / 2)
+        heading = world.heading(i)
         off = np.r_[rng.normal(0, np.radians(3), 3), rng.normal(0, 0.05, 3)]
         ideal = pose(so3_exp((0.0, 0.0, heading)) @ _AXES, so3_exp((0.0, 0.0, heading)) @ (0.2, 0.0, -0.15))
         models[f"cam{i}"] = model(i)
@@ -72,7 +77,7 @@ def simulate(world: World, seed: int) -> tuple[Scene, dict[str, F8]]:
     offsets = world.range_offset_m * (rng.normal() + rng.normal(size=world.beams))
     placements: list[Placement] = []
     while len(placements) < world.placements:
-        T_lidar_board = _stand(world, rng)
+        T_lidar_board = _stand(world, world.heading(len(placements) % world.cameras), rng)
         images = {
             camera: seen
             for camera, lens in models.items()
@@ -84,9 +89,9 @@ def simulate(world: World, seed: int) -> tuple[Scene, dict[str, F8]]:
     return Scene.of(world.board, models, tuple(placements)), poses
 
 
-def _stand(world: World, rng: np.random.Generator) -> F8:
-    """A board hung as a diamond somewhere ahead, tilted and turned as hands do."""
-    heading = np.radians(rng.uniform(-25.0 * world.cameras, 25.0 * world.cameras))
+def _stand(world: World, ahead: float, rng: np.random.Generator) -> F8:
+    """A board hung as a diamond somewhere before a camera, tilted and turned as hands do."""
+    heading = ahead + np.radians(rng.uniform(-25.0, 25.0))
     away = rng.uniform(*world.distance_m)
     place = away * np.array([np.cos(heading), np.sin(heading), rng.uniform(-0.15, 0.1)])
     facing = so3_exp((0.0, 0.0, heading)) @ np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -211,3 +216,45 @@ def shifted(placement: Placement, T_move: F8) -> Placement:
     """The board moved between cloud and images: its points lie elsewhere, `T_move` in the LiDAR's frame."""
     cloud = placement.cloud
     return replace(placement, cloud=replace(cloud, T_lidar_board=T_move @ cloud.T_lidar_board))
+
+
+def glared(
+    placement: Placement, models: Mapping[str, CameraModel], board: Board, rng: np.random.Generator
+) -> Placement:
+    """A reflection draws the corners of a third of the board some pixels towards itself, in every image."""
+    images = {}
+    for camera, seen in placement.images.items():
+        middle = seen.pixels[rng.integers(len(seen.pixels))]
+        near = np.argsort(np.linalg.norm(seen.pixels - middle, axis=1))[: len(seen.pixels) // 3]
+        pixels = seen.pixels.copy()
+        pixels[near] += rng.normal(4.0, 2.0, 2) + rng.normal(0, 2.0, (len(near), 2))
+        fit = board_pose(Bearings.of(models[camera], pixels), board.corners_m()[seen.index])
+        if fit is not None:
+            images[camera] = replace(
+                seen, pixels=pixels, sigma_px=fit.rms_px, T_camera_board=fit.T_camera_board
+            )
+    return replace(placement, images=images)
+
+
+def other_board(
+    placement: Placement,
+    models: Mapping[str, CameraModel],
+    poses: Mapping[str, F8],
+    world: World,
+    rng: np.random.Generator,
+) -> Placement:
+    """The images show a board with squares of four fifths, in the same place."""
+    small = world.board.model_copy(update={"square_m": 0.8 * world.board.square_m})
+    images = {}
+    for camera, seen in placement.images.items():
+        there = transform(
+            inverse(poses[camera]) @ placement.cloud.T_lidar_board, small.corners_m()[seen.index]
+        )
+        pixels, _ = project(models[camera], there)
+        pixels = pixels + rng.normal(0, world.corner_sigma_px, pixels.shape)
+        fit = board_pose(Bearings.of(models[camera], pixels), world.board.corners_m()[seen.index])
+        if fit is not None:
+            images[camera] = replace(
+                seen, pixels=pixels, sigma_px=fit.rms_px, T_camera_board=fit.T_camera_board
+            )
+    return replace(placement, images=images)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from scanloom.stages.calibrate.acceptance import Checks, check
 from scanloom.stages.calibrate.boards import Pair, agree, pairs_of, scattered, strangers
@@ -69,7 +69,7 @@ def calibrate(scene: Scene, settings: CalibrateSettings, given: Mapping[str, F8]
     noise = _noise(settings)
     begin = first.T_lidar_camera
     if settings.method == "board":
-        rough = solve(scene, _begin(scene, begin, noise, settings), noise.with_bias(_ROUGH, _ROUGH[3]))
+        rough = solve(scene, *_begin(scene, begin, noise.with_bias(_ROUGH, _ROUGH[3]), settings))
         begin, noise = rough.T_lidar_camera, scattered(scene, noise, rough.T_lidar_camera, rough.sensor)
     solver = solve_paper if settings.method == "paper" else solve
     estimate = solver(scene, begin, noise)
@@ -87,11 +87,15 @@ def calibrate(scene: Scene, settings: CalibrateSettings, given: Mapping[str, F8]
 
 def _begin(
     scene: Scene, begin: Mapping[str, F8], noise: Noise, settings: CalibrateSettings
-) -> Mapping[str, F8]:
-    """Whole boards bring the start near, unless it was given and is to be tried as it is."""
+) -> tuple[Mapping[str, F8], Noise]:
+    """Whole boards bring the start near. One that was given is tried as it is, by plain squares: hundreds of pixels off,
+    a loss that grows slowly knows no way."""
     if settings.start == "given":
-        return begin
-    return agree(pairs_of(scene, noise.with_bias(_ROUGH, _ROUGH[3])), begin).T_lidar_camera
+        return begin, replace(noise, softness=_NO_LIMIT)
+    return agree(pairs_of(scene, noise), begin).T_lidar_camera, noise
+
+
+_NO_LIMIT = 1e9
 
 
 def _noise(settings: CalibrateSettings) -> Noise:

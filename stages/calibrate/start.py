@@ -27,7 +27,7 @@ class Start:
     scene: Scene
     T_lidar_camera: dict[str, F8]
     agreeing: dict[str, tuple[str, ...]]
-    """By camera: placements that agree with it."""
+    """By camera: placements that agree with it; all where a start was given, which may be far off."""
 
 
 def start(scene: Scene, given: Mapping[str, F8] | None = None) -> Start:
@@ -47,9 +47,11 @@ def start(scene: Scene, given: Mapping[str, F8] | None = None) -> Start:
                     scene, p, p.images[camera], rough, by_turn=told is not None
                 )
         here = replace(scene, placements=_reordered(scene, ordered))
+        if told is not None:
+            poses[camera], agreeing[camera] = told, tuple(p.name for p in here.seen_by(camera))
+            continue
         near = _agreeing(here, camera, rough)
-        poses[camera] = rough if told is not None else epnp(here, camera, near, rough)
-        agreeing[camera] = near
+        poses[camera], agreeing[camera] = epnp(here, camera, near, rough), near
     return Start(replace(scene, placements=_reordered(scene, ordered)), poses, agreeing)
 
 
