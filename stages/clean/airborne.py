@@ -10,6 +10,7 @@ of the ground, also that which has something in the air around it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +20,15 @@ from scanloom.schemas.scans import DeskewedScan, PointClass
 from scanloom.stages.clean import weights
 from scanloom.stages.clean.around import (
     AIR,
+    DIM,
     GROUND,
     NOTHING,
     OTHER,
     SOLID,
     WENT,
+    look_beside,
     over_ground,
     seen_ranges,
-    sticks_out,
 )
 from scanloom.stages.clean.clusters import clusters
 from scanloom.stages.clean.incidence import I4
@@ -46,7 +48,7 @@ BRIGHT, SAMPLED, LEAST_BRIGHT = 0.8, 8, 50
 nothing."""
 ROUNDED = 0.01
 """When more than this share of what stands has the very lowest intensity, that tells nothing."""
-LEAST_ODDS = (0.0, -0.3)
+LEAST_ODDS = (-0.3, -0.3, -0.6)
 """Log-odds of each round from which on a return is in the air."""
 STANDS = int(Standing.STANDS)
 HEARD_AGAIN = -6.0
@@ -79,6 +81,15 @@ AFTERWARDS = np.array([OTHER, SOLID, WENT, WENT], np.uint8)
 """What is neither ground nor in the air is taken for, by Standing."""
 
 
+class Light(NamedTuple):
+    """Intensities of what stands in a scan."""
+
+    bright: float
+    """Of the brighter ones."""
+    lost: float
+    """At and below this an intensity tells nothing: it was rounded off."""
+
+
 @dataclass(frozen=True)
 class Known:
     """What is known of the returns (n,) of a scan."""
@@ -102,14 +113,32 @@ class Known:
     """Those (m,) that may be in the air (`may_fly`)."""
     near: U1
     """(n, 2): how many of the 26 voxels around stand, and went; of those asked about."""
+    contrast: U1
+    """Bins of their intensity over that of the returns beside them."""
+    light: Light | None
 
 
-def may_fly(scan: DeskewedScan, classes: U1, said: U1, taken: U1, cell: I4, away_m: F4, image: I4) -> I8:
-    """Returns (m,) that are asked about, by class and Standing (n,) and by what is around them."""
-    asked = by_standing(said, classes, ASKED).view(np.bool_)
-    asked |= sticks_out(away_m, classes, cell, image)
+def light_of(scan: DeskewedScan, said: U1) -> Light | None:
+    """What the intensities of a scan are relative to; None when they tell nothing. said (n,): Standing."""
+    standing = scan.intensity[_some_standing(said)]
+    standing = standing[np.isfinite(standing)]
+    if len(standing) < LEAST_BRIGHT or np.ptp(standing) == 0.0:
+        return None
+    faintest = float(standing.min())
+    rounded = np.mean(standing == faintest) > ROUNDED
+    return Light(float(np.quantile(standing, BRIGHT)), faintest if rounded else -np.inf)
+
+
+def may_fly(
+    scan: DeskewedScan, classes: U1, said: U1, taken: U1, cell: I4, away_m: F4, image: I4, light: Light | None
+) -> tuple[I8, U1]:
+    """Returns (m,) that are asked about, by class and Standing (n,) and by what is around them; contrasts (n,)."""
+    lost = np.inf if light is None else light.lost
+    out, contrast = look_beside(away_m, scan.intensity, lost, classes, cell, image)
+    asked = by_standing(said, classes, ASKED).view(np.bool_) | out
+    asked |= (contrast > 0) & (contrast <= DIM)
     asked |= over_ground(scan.x_m, scan.y_m, scan.z_m, away_m, classes, taken, cell, image)
-    return np.flatnonzero(asked)
+    return np.flatnonzero(asked), contrast
 
 
 def airborne(scan: DeskewedScan, known: Known, apart_m: float) -> B1:
@@ -149,15 +178,11 @@ def things(known: Known, loose: B1, apart_m: float) -> I4:
 def strengths(scan: DeskewedScan, known: Known) -> U1:
     """Bin (n,) of the intensity of each return asked about, relative to the brighter ones of what stands."""
     out = np.full(len(scan), NO_STRENGTH, np.uint8)
-    standing = scan.intensity[_some_standing(known.said)]
-    standing = standing[np.isfinite(standing)]
-    if len(standing) < LEAST_BRIGHT or np.ptp(standing) == 0.0:
+    if known.light is None:
         return out
-    intensity, faintest = scan.intensity[known.asked], standing.min()
-    bright = float(np.quantile(standing, BRIGHT))
-    bins = np.searchsorted(STRENGTH_EDGES * bright, intensity, side="right")
-    if np.mean(standing == faintest) > ROUNDED:
-        bins[intensity <= faintest] = NO_STRENGTH
+    intensity = scan.intensity[known.asked]
+    bins = np.searchsorted(STRENGTH_EDGES * known.light.bright, intensity, side="right")
+    bins[intensity <= known.light.lost] = NO_STRENGTH
     out[known.asked] = bins
     return out
 
@@ -169,7 +194,7 @@ def evidence(
     return np.asarray(
         signs(
             scan.x_m, scan.y_m, scan.z_m, known.away_m, known.classes, known.said, known.box, known.beside, known.near,
-            known.cell, known.image, ranges, thing, strength, taken, loose, asked,
+            known.cell, known.image, ranges, thing, strength, known.contrast, taken, loose, asked,
         )
     )  # fmt: skip
 

@@ -9,6 +9,7 @@ from scanloom.schemas.scans import PointClass
 from scanloom.stages.clean.incidence import COLUMN_BITS, I4, LAST_COLUMN, ROWS
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.voxels import Int
 
 B1 = NDArray[np.bool_]
 F4 = NDArray[np.float32]
@@ -30,6 +31,19 @@ ROUNDED, ZERO = 1.0001, np.float32(0.0)
 """Returns whose ranges differ by so many times the distance are farther apart than it."""
 NEXT, OUT_M = 2, 0.3
 """What is nearer by so much than the next returns, in as many cells to the left and to the right, sticks out."""
+CONTRAST_EDGES = np.array([0.08, 0.15, 0.25, 0.4, 0.6, 0.8])
+"""Of intensities over those beside."""
+ASIDE, UPWARDS = 2, 4
+"""Cells to the left and to the right, and upwards and downwards, in which the next returns are looked for that a line is
+drawn between."""
+NOISE_M, NOISE_PER_M = 0.05, 0.005
+"""A return is on a line if it is off it by less than this."""
+BENT, BROKEN = 4.0, 20.0
+"""So many times as much is a bend, and a break."""
+OFF_LINE = 6
+"""Bins of how a return lies to a line."""
+DIM = 3
+"""Bins of contrast from 1 to this one: much fainter than both returns beside it, which are about as far away."""
 
 
 @kernel
@@ -96,23 +110,71 @@ def over_ground(x: F4, y: F4, z: F4, away: F4, classes: U1, taken: U1, cell: I4,
 
 
 @kernel
-def sticks_out(away: F4, classes: U1, cell: I4, image: I4) -> B1:
-    """Which returns (n,), `away` m from the sensor, stick out; the own vehicle and what is out of range never do."""
-    out = np.zeros(len(away), np.bool_)
+def look_beside(away: F4, intensity: F4, lost: float, classes: U1, cell: I4, image: I4) -> tuple[B1, U1]:
+    """Which returns (n,), `away` m from the sensor, stick out, and bins (n,) of their contrast to those beside them.
+
+    Intensities up to `lost` tell nothing. The own vehicle and what is out of range never stick out and have no contrast.
+    """
+    out, contrast = np.zeros(len(away), np.bool_), np.zeros(len(away), np.uint8)
     for n in range(len(away)):
         if cell[n] < 0 or classes[n] == EGO or classes[n] == OUT_OF_RANGE:
             continue
         row, column = cell[n] >> COLUMN_BITS, cell[n] & LAST_COLUMN
-        left = _is_beyond(away, image, row, column, -1, away[n] + OUT_M)
-        out[n] = left and _is_beyond(away, image, row, column, 1, away[n] + OUT_M)
-    return out
+        left, right = _next(image, row, column, -1), _next(image, row, column, 1)
+        beyond, near = away[n] + OUT_M, NEAR_M + NEAR_PER_M * away[n]
+        out[n] = left >= 0 and right >= 0 and away[left] > beyond and away[right] > beyond
+        contrast[n] = _contrast(away, intensity, lost, n, left, right, near)
+    return out, contrast
 
 
 @kernel
-def _is_beyond(away: F4, image: I4, row: int, column: int, side: int, beyond_m: float) -> bool:
-    """Whether there is a return next to it on a side, farther off than that."""
+def _next(image: I4, row: int, column: int, side: int) -> int:
+    """The return next to a cell on a side, -1 when there is none."""
     for step in range(1, NEXT + 1):
         j = image[row, (column + side * step) & LAST_COLUMN]
         if j >= 0:
-            return bool(away[j] > beyond_m)
-    return False
+            return int(j)
+    return -1
+
+
+@kernel
+def _contrast(away: F4, intensity: F4, lost: float, n: int, left: int, right: int, near: float) -> int:
+    """Bin of the intensity of a return over that of the fainter of the near returns beside it; 0 when that tells nothing."""
+    if not intensity[n] > lost:
+        return 0
+    count, fainter = 0, np.inf
+    for j in (left, right):
+        if j >= 0 and abs(away[j] - away[n]) < near and intensity[j] > lost:
+            count += 1
+            fainter = min(fainter, float(intensity[j]))
+    if count == 0:
+        return 0
+    first = 1 if count == 2 else 1 + len(CONTRAST_EDGES) + 1
+    k = 0
+    while k < len(CONTRAST_EDGES) and intensity[n] >= CONTRAST_EDGES[k] * fainter:
+        k += 1
+    return first + k
+
+
+@kernel
+def off_line(ranges: F4, row: int, column: Int, r: float, upwards: int, aside: int, farthest: int) -> int:
+    """Bin of how far a return at range `r` is off the line between the next ones on either side: no line, on it, about on it,
+    before it, far before it, behind it. Lines are straight in 1 / range.
+    """
+    a, b, to_a, to_b = 0.0, 0.0, 0, 0
+    for step in range(1, farthest + 1):
+        if to_a == 0 and 0 <= row + step * upwards < ROWS:
+            a = float(ranges[row + step * upwards, (column + step * aside) & LAST_COLUMN])
+            to_a = step if a > 0.0 else 0
+        if to_b == 0 and 0 <= row - step * upwards < ROWS:
+            b = float(ranges[row - step * upwards, (column - step * aside) & LAST_COLUMN])
+            to_b = step if b > 0.0 else 0
+    if to_a == 0 or to_b == 0:
+        return 0
+    before = (to_a + to_b) * a * b / (to_a * a + to_b * b) - r
+    noise = NOISE_M + NOISE_PER_M * r
+    if abs(before) < BENT * noise:
+        return 1 if abs(before) < noise else 2
+    if before < 0.0:
+        return 5
+    return 3 if before < BROKEN * noise else 4

@@ -23,14 +23,14 @@ from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass, ScanLabels
 from scanloom.schemas.trajectory import Poses
 from scanloom.stages.clean import incidence
-from scanloom.stages.clean.airborne import TAKEN, Known, airborne, by_standing, may_fly
+from scanloom.stages.clean.airborne import TAKEN, Known, airborne, by_standing, light_of, may_fly
 from scanloom.stages.clean.clusters import clusters
 from scanloom.stages.clean.lookup import Verdicts
 from scanloom.stages.clean.moving import MovingBoxes, where_boxed
 from scanloom.stages.clean.things import judge_things, settle
 from scanloom.stages.geometry.se3 import F8
 
-VERSION = 4
+VERSION = 5
 
 U1 = NDArray[np.uint8]
 B1 = NDArray[np.bool_]
@@ -151,9 +151,12 @@ def final(settings: Settings, scan: DeskewedScan, classes: U1, known: _Map) -> U
     )
     if settings.particles:
         taken = by_standing(said, classes, TAKEN)
-        asked = may_fly(scan, classes, said, taken, cell, away_m, known.image)
+        light = light_of(scan, said)
+        asked, contrast = may_fly(scan, classes, said, taken, cell, away_m, known.image, light)
         beside = known.verdicts.around(scan, asked, T_world_lidar)
-        all_known = Known(classes, said, box, around, cell, away_m, known.image, taken, asked, beside)
+        all_known = Known(
+            classes, said, box, around, cell, away_m, known.image, taken, asked, beside, contrast, light
+        )
         fly = airborne(scan, all_known, settings.apart_m)
     else:
         fly = (classes == AIRBORNE) & (said != Standing.STANDS) & (box < 0)

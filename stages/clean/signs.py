@@ -11,7 +11,20 @@ from numpy.typing import NDArray
 
 from scanloom.schemas.clean import Standing
 from scanloom.schemas.scans import PointClass
-from scanloom.stages.clean.around import AIR, BEYOND, GROUND, NOTHING, SOLID, WENT, look_around
+from scanloom.stages.clean.around import (
+    AIR,
+    ASIDE,
+    BEYOND,
+    GROUND,
+    NOTHING,
+    OFF_LINE,
+    SOLID,
+    UPWARDS,
+    WENT,
+    look_around,
+    off_line,
+)
+from scanloom.stages.clean.incidence import COLUMN_BITS, LAST_COLUMN
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8
 
@@ -26,8 +39,10 @@ AIRBORNE, OUTLIER = int(PointClass.AIRBORNE), int(PointClass.OUTLIER)
 MOVED = int(Standing.MOVED)
 
 WHAT, THING, SOLID_AROUND, AIR_AROUND, FAR, BOX, THING_WENT, WEATHER, STRENGTH, BEHIND = range(10)
-NEAR_STANDS, NEAR_WENT, WENT_AROUND, HEIGHT, CLOUD, CLASS_IN_WEATHER, CLASS_STRENGTH = range(10, 17)
-KINDS = 17
+NEAR_STANDS, NEAR_WENT, WENT_AROUND, HEIGHT, CLOUD, CLASS_IN_WEATHER, CLASS_STRENGTH, CONTRAST, ROUGH = range(
+    10, 19
+)
+KINDS = 19
 
 SHARE_EDGES = np.array([1e-6, 0.1, 0.3, 0.5, 0.8, 1.0 - 1e-6])
 SIZE_EDGES = np.array([2.0, 5.0, 20.0, 100.0])
@@ -54,12 +69,12 @@ HALF = 3
 @kernel
 def signs(
     x: F4, y: F4, z: F4, away: F4, classes: U1, said: U1, box: I4, beside: B1, near: U1, cell: I4, image: I4,
-    ranges: F4, thing: I4, strength: U1, taken: U1, loose: B1, asked: I8,
+    ranges: F4, thing: I4, strength: U1, contrast: U1, taken: U1, loose: B1, asked: I8,
 ) -> U1:  # fmt: skip
     """Bins (m, KINDS) of the returns asked about, all (n,) being what they are taken for.
 
     away (n,): ranges, m; `ranges` those in the image (`seen_ranges`). near (n, 2): voxels around that stand, that went. loose (n,): what things are counted of.
-    strength (n,): bins.
+    strength, contrast (n,): bins.
     """
     members = np.flatnonzero(loose)
     size, air, went = _of_things(said, taken, thing, members)
@@ -80,12 +95,24 @@ def signs(
         found[m, CLASS_IN_WEATHER] = CLASSES * (2 * share + (cloudy > 1)) + what
         found[m, STRENGTH] = RANGES * strength[n] + far
         found[m, CLASS_STRENGTH] = CLASSES * strength[n] + what
+        found[m, CONTRAST] = CLASSES * contrast[n] + what
+        found[m, ROUGH] = 2 * _rough(ranges, cell[n], away[n]) + (what == 2)
         found[m, NEAR_STANDS] = CLASSES * _bin_of(float(near[n, 0]), NEAR_EDGES) + what
         found[m, NEAR_WENT] = CLOUDY * _bin_of(float(near[n, 1]), NEAR_EDGES) + cloudy
         _write_thing(size[t], air[t], went[t], far, cloudy, found[m])
         look_around(x, y, z, away, n, cell[n], image, ranges, taken, around, ground_m)
         _write_around(around, z[n] - ground_m[0] / max(around[GROUND], 1), far, what, beside[n], found[m])
     return found
+
+
+@kernel
+def _rough(ranges: F4, cell: int, r: float) -> int:
+    """How a return lies to the lines between those left and right of it, and above and below."""
+    if cell < 0:
+        return 0
+    row, column = cell >> COLUMN_BITS, cell & LAST_COLUMN
+    beside = off_line(ranges, row, column, r, 0, 1, ASIDE)
+    return OFF_LINE * beside + off_line(ranges, row, column, r, 1, 0, UPWARDS)
 
 
 @kernel

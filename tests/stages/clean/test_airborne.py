@@ -21,6 +21,7 @@ from scanloom.stages.clean.airborne import (
     by_standing,
     evidence,
     is_loose,
+    light_of,
     may_fly,
     strengths,
     taken_next,
@@ -30,12 +31,14 @@ from scanloom.stages.clean.around import (
     AIR,
     GROUND,
     NOTHING,
+    OFF_LINE,
     OTHER,
     SOLID,
     look_around,
+    look_beside,
+    off_line,
     over_ground,
     seen_ranges,
-    sticks_out,
 )
 from scanloom.stages.clean.field import brick_key, brick_table
 from scanloom.stages.clean.lookup import standing, standing_around
@@ -171,9 +174,11 @@ def known_of(drive: Drive, said: np.ndarray) -> Known:
     image = incidence.new_image()
     cell, away_m = incidence.fill(scan.x_m, scan.y_m, scan.z_m, image)
     taken = by_standing(said, classes, TAKEN)
-    asked = may_fly(scan, classes, said, taken, cell, away_m, image)
+    light = light_of(scan, said)
+    asked, contrast = may_fly(scan, classes, said, taken, cell, away_m, image, light)
     none = np.full(n, -1, np.int32), np.zeros(n, bool)
-    return Known(classes, said, *none, cell, away_m, image, taken, asked, np.zeros((n, 2), np.uint8))
+    around = np.zeros((n, 2), np.uint8)
+    return Known(classes, said, *none, cell, away_m, image, taken, asked, around, contrast, light)
 
 
 def test_evidence_stays_within_its_tables() -> None:
@@ -196,6 +201,10 @@ def test_evidence_stays_within_its_tables() -> None:
     assert len(np.unique(found[:, signs.WEATHER])) == 1
     assert len(np.unique(found[:, signs.NEAR_STANDS] // signs.CLASSES)) == 5
     assert (taken == AIR).sum() > 10
+    assert found[:, signs.CONTRAST].max() < 5 * 15
+    assert found[:, signs.ROUGH].max() < 2 * OFF_LINE**2
+    assert len(np.unique(found[:, signs.CONTRAST])) >= 8
+    assert len(np.unique(found[:, signs.ROUGH])) >= 10
 
 
 def test_ground_is_made_of_no_thing_and_stays_ground_when_it_does_not_fly() -> None:
@@ -219,7 +228,9 @@ def test_what_is_nearer_than_both_its_neighbours_sticks_out() -> None:
         image = incidence.new_image()
         cell, away_m = incidence.fill(x, y, np.zeros_like(x), image)
         for class_ in (PointClass.GROUND, PointClass.STATIC, PointClass.EGO, PointClass.OUT_OF_RANGE):
-            found = sticks_out(away_m, np.full(11, class_, np.uint8), cell, image)
+            classes, dark = np.full(11, class_, np.uint8), np.zeros(11, np.float32)
+            found, contrast = look_beside(away_m, dark, 0.0, classes, cell, image)
+            assert not contrast.any()
             counted = class_ in (PointClass.GROUND, PointClass.STATIC)
             assert found.tolist() == [is_out and counted and n == 5 for n in range(11)]
 
@@ -260,7 +271,9 @@ def test_standing_and_gone_voxels_around_are_counted_across_bricks_without_the_o
 def test_a_sensor_that_tells_no_intensity_is_not_asked_for_it(intensity: float) -> None:
     drive, _ = in_dust(6, 0.5, count=1)
     scan = replace(drive.scans[0], intensity=np.full(len(drive.scans[0]), intensity, np.float32))
-    known = known_of(drive, np.ones(len(scan), np.uint8))
+    known = known_of(replace(drive, scans=[scan]), np.ones(len(scan), np.uint8))
+    assert known.light is None
+    assert not known.contrast.any()
     assert (strengths(scan, known) == NO_STRENGTH).all()
     assert airborne(scan, known, 0.4).shape == (len(scan),)
 
@@ -273,7 +286,12 @@ def test_an_intensity_that_is_rounded_off_tells_nothing() -> None:
     assert (strengths(scan, known)[rows] < NO_STRENGTH).all()
     rounded = scan.intensity.copy()
     rounded[dust], rounded[np.flatnonzero(~dust)[::16]] = 0.0, 0.0
-    assert (strengths(replace(scan, intensity=rounded), known)[rows] == NO_STRENGTH).all()
+    scan = replace(scan, intensity=rounded)
+    known = known_of(replace(drive, scans=[scan]), known.said)
+    assert known.light is not None
+    assert known.light.lost == 0.0
+    assert (strengths(scan, known)[rows] == NO_STRENGTH).all()
+    assert not known.contrast[rows].any()
 
 
 def test_voxels_around_are_those_of_each_by_itself() -> None:
@@ -327,3 +345,45 @@ def test_what_lies_around_is_counted_as_one_by_one() -> None:
         assert ground_m[0] == pytest.approx(z[near & (taken == GROUND)].sum(), abs=1e-5)
         beyond += expected[NOTHING]
     assert beyond > 100
+
+
+@pytest.mark.parametrize(
+    ("own", "left", "right", "left_m", "found"),
+    [
+        (7.9, 100.0, 100.0, 10.0, 1), (8.1, 100.0, 100.0, 10.0, 2), (20.0, 100.0, 100.0, 10.0, 3),
+        (26.0, 100.0, 100.0, 10.0, 4), (20.0, 100.0, 20.0, 10.0, 7), (99.0, 100.0, 120.0, 10.8, 7),
+        (20.0, 100.0, 100.0, 12.0, 10), (90.0, 100.0, 100.0, 12.0, 14), (20.0, 2.0, 100.0, 10.0, 10),
+        (2.0, 100.0, 100.0, 10.0, 0), (np.nan, 100.0, 100.0, 10.0, 0),
+    ],
+)  # fmt: skip
+def test_contrast_is_told_against_the_fainter_of_what_is_near_beside(
+    own: float, left: float, right: float, left_m: float, found: int
+) -> None:
+    """At 10 m, 0.9 m is near; intensities up to 2 are lost."""
+    angle = np.radians([-0.2, 0.15, 0.5])
+    r = np.array([left_m, 10.0, 10.2])
+    x, y = (r * np.cos(angle)).astype(np.float32), (r * np.sin(angle)).astype(np.float32)
+    image = incidence.new_image()
+    cell, away_m = incidence.fill(x, y, np.zeros_like(x), image)
+    intensity = np.array([left, own, right], np.float32)
+    for class_ in (PointClass.GROUND, PointClass.EGO):
+        classes = np.full(3, class_, np.uint8)
+        contrast = look_beside(away_m, intensity, 2.0, classes, cell, image)[1]
+        assert contrast[1] == (found if class_ == PointClass.GROUND else 0)
+
+
+@pytest.mark.parametrize(
+    ("off_m", "found"),
+    [(0.0, 1), (0.09, 1), (-0.09, 1), (0.15, 2), (-0.35, 2), (0.45, 3), (1.75, 3), (1.9, 4), (-0.45, 5)],
+)
+def test_a_return_lies_on_before_or_behind_the_line_between_others(off_m: float, found: int) -> None:
+    """On a wall 10 m to the side the noise is 0.1 m; before it less, with the range."""
+    way = np.arange(-2, 2) * 2 * np.pi / incidence.COLUMNS
+    ranges = np.zeros((incidence.ROWS, incidence.COLUMNS), np.float32)
+    ranges[100, 498:502] = 10.0 / np.cos(way)
+    ranges[[97, 102], 600] = 10.0
+    assert off_line(ranges, 100, 500, 10.0 - off_m, 0, 1, 2) == found
+    assert off_line(ranges, 100, 600, 10.0 - off_m, 1, 0, 4) == found
+    assert off_line(ranges, 100, 600, 10.0 - off_m, 1, 0, 2) == 0
+    assert off_line(ranges, 100, 503, 10.0, 0, 1, 2) == 0
+    assert off_line(ranges, 0, 600, 10.0, 1, 0, 4) == 0
