@@ -43,25 +43,40 @@ class Silent:
 
 
 class Lines:
-    """One line through `logging` whenever a stage is done, and for every note."""
+    """One line through `logging` whenever a stage is done, for every note, and now and then for a stage that takes long."""
 
-    def __init__(self) -> None:
+    def __init__(self, every_s: float = 30.0) -> None:
         self._titles: dict[str, str] = {}
         self._said: dict[str, tuple[int, int]] = {}
-        self._started = time.monotonic()
+        self._since: dict[str, float] = {}
+        self._every_s = every_s
+        self._last = self._started = time.monotonic()
 
     def begin(self, stages: Sequence[tuple[str, str]]) -> None:
         self._titles = dict(stages)
-        self._started = time.monotonic()
+        self._said, self._since = {}, {}
+        self._last = self._started = time.monotonic()
 
     def update(self, counts: Mapping[str, tuple[int, int, int]]) -> None:
         for name, (over, running, known) in counts.items():
+            if running:
+                self._since.setdefault(name, time.monotonic())
             complete = known and over == known and not running
             if complete and self._said.get(name) != (over, known):
                 self._said[name] = (over, known)
-                log.info(
-                    "%6.1f s  %s: %d of %d", time.monotonic() - self._started, self._titles[name], over, known
-                )
+                self._say(name, over, known)
+        if time.monotonic() - self._last > self._every_s:
+            self._say_under_way(counts)
+
+    def _say_under_way(self, counts: Mapping[str, tuple[int, int, int]]) -> None:
+        for name, (over, running, known) in counts.items():
+            if running and 0 < over < known:
+                left_s = (time.monotonic() - self._since[name]) / over * (known - over)
+                self._say(name, over, known, f", about {left_s:.0f} s left")
+
+    def _say(self, name: str, over: int, known: int, more: str = "") -> None:
+        self._last = time.monotonic()
+        log.info("%6.1f s  %s: %d of %d%s", self._last - self._started, self._titles[name], over, known, more)
 
     def note(self, text: str) -> None:
         log.warning("%s", text)

@@ -15,12 +15,12 @@ from typing import Annotated, Any
 import typer
 
 from scanloom.schemas.errors import EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_OK, ScanloomError, UsageError
+from scanloom.workflows.examples import complete_formats, epilog
 
 app = typer.Typer(
     name="scanloom",
     help="Weaves vehicle and robot logs into georeferenced, cleaned, tiled 3D maps.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 
@@ -40,7 +40,11 @@ WorkersOption = Annotated[
 ]
 ExportOption = Annotated[
     str,
-    typer.Option("--export", help="Formats to export the map to as well, separated by commas, as laz,copc."),
+    typer.Option(
+        "--export",
+        help="Formats to export the map to as well, separated by commas, as laz,copc.",
+        autocompletion=complete_formats,
+    ),
 ]
 ProjectOption = Annotated[
     Path | None, typer.Option("--project", help="Settings file (default ./scanloom.yaml when present).")
@@ -81,6 +85,8 @@ def main() -> None:
         code = app(standalone_mode=False)
         sys.exit(code if isinstance(code, int) else EXIT_OK)
     except ScanloomError as error:
+        if "--json" in sys.argv:
+            _emit(_as_json(error))
         _fail(str(error), error.exit_code)
     except KeyboardInterrupt:
         _fail("interrupted; the same command continues where it stopped", EXIT_INTERRUPTED)
@@ -106,12 +112,17 @@ def _fail(message: str, code: int) -> None:
     sys.exit(code)
 
 
+def _as_json(error: ScanloomError) -> dict[str, Any]:
+    told = {"what": error.what, "where": error.where, "next_step": error.next_step}
+    return {"error": told, "exit_code": error.exit_code}
+
+
 def _say(message: str) -> None:
     print(message, file=sys.stderr)
 
 
 def _emit(body: Any) -> None:
-    print(json.dumps(body, indent=1, default=str))
+    print(json.dumps(body, indent=1, default=str), flush=True)
 
 
 def _process_start_s() -> float:
@@ -174,7 +185,7 @@ def map_command(
         _show_plan(*plan_map(order), as_json)
         return
     outcome = build_map(order, progress_for(sys.stderr))
-    exported = _export_after(outcome, export_to)
+    outcome, exported = _export_after(outcome, export_to)
     _show_outcome(outcome, exported, as_json)
     raise typer.Exit(outcome.exit_code)
 
@@ -233,7 +244,7 @@ def extend(
         _show_plan(*plan_map(order), as_json)
         return
     outcome = build_map(order, progress_for(sys.stderr))
-    exported = _export_after(outcome, export_to)
+    outcome, exported = _export_after(outcome, export_to)
     _show_outcome(outcome, exported, as_json)
     raise typer.Exit(outcome.exit_code)
 
@@ -261,12 +272,14 @@ def _check_formats(names: str) -> None:
         formats_of(names)
 
 
-def _export_after(outcome: Any, names: str) -> list[Any]:
+def _export_after(outcome: Any, names: str) -> tuple[Any, list[Any]]:
+    """The outcome with what failed to be exported, and what was exported. The map is there in any case."""
     if not names or not outcome.delivered:
-        return []
-    from scanloom.workflows.export_map import export_map, options_of
+        return outcome, []
+    from scanloom.pipeline.progress import progress_for
+    from scanloom.workflows.export_after import export_after
 
-    return export_map(outcome.out, names, options_of())
+    return export_after(outcome, names, progress_for(sys.stderr))
 
 
 def _show_outcome(outcome: Any, exported: list[Any], as_json: bool) -> None:
@@ -456,7 +469,11 @@ def export(
     ] = None,
     formats: Annotated[
         str,
-        typer.Option("--format", help="Formats, separated by commas; `scanloom export --list` names them."),
+        typer.Option(
+            "--format",
+            help="Formats, separated by commas; `scanloom export --list` names them.",
+            autocompletion=complete_formats,
+        ),
     ] = "",
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder of the exports (default MAP/exports).")
@@ -490,7 +507,8 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """A map into other formats: point clouds with their coordinate system, trajectories, rasters, web tiles."""
-    from scanloom.workflows.export_map import export_map, known_formats, options_of
+    from scanloom.pipeline.progress import progress_for
+    from scanloom.workflows.export_map import export_all, known_formats, options_of
 
     if list_all:
         rows = known_formats()
@@ -507,12 +525,16 @@ def export(
         cell_m=cell_m,
         fill_cells=fill_cells,
     )
-    done = export_map(folder, formats, options, out)
+    done, failures = export_all(folder, formats, options, out, progress_for(sys.stderr))
     if as_json:
-        _emit([entry.as_json() for entry in done])
+        failed = [{"format": name, "error": str(error)} for name, error in failures]
+        _emit([entry.as_json() for entry in done] + failed)
     else:
         for entry in done:
             print(entry.text())
+    for name, error in failures:
+        _say(f"scanloom: {name}: {error}")
+    raise typer.Exit(failures[0][1].exit_code if failures else EXIT_OK)
 
 
 @app.command()
@@ -522,11 +544,12 @@ def view(
         int, typer.Option("--port", min=0, max=65535, help="Of 127.0.0.1; 0 takes any that is free.")
     ] = 8642,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
+    as_json: JsonOption = False,
 ) -> None:
     """A map in the browser: served on this machine alone, streamed by level of detail; ends with Ctrl-C."""
     from scanloom.workflows.view_map import view_map
 
-    view_map(folder, port, browser, _say)
+    view_map(folder, port, browser, _say, _emit if as_json else None)
 
 
 @app.command()
@@ -603,6 +626,10 @@ def warm() -> None:
     started = time.monotonic()
     warm_kernels()
     _say(f"setup: done in {time.monotonic() - started:.0f} s")
+
+
+for _command in app.registered_commands:
+    _command.epilog = epilog(str(_command.name or getattr(_command.callback, "__name__", "")))
 
 
 if __name__ == "__main__":

@@ -17,21 +17,22 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from scanloom.schemas.errors import StoreError, UsageError
-from scanloom.stages.exports.clouds import box_of, points_of
+from scanloom.pipeline.progress import Progress, Silent
+from scanloom.schemas.errors import ScanloomError, StoreError, UsageError
+from scanloom.stages.exports.clouds import box_of, part_names, points_of
 from scanloom.stages.exports.coordinates import Projector
 from scanloom.stages.exports.formats import FORMATS, Format, chosen
 from scanloom.stages.exports.options import Options
 from scanloom.stages.exports.source import HEADER, MapSource
 from scanloom.workflows.delivery import write_text
+from scanloom.workflows.heard import Heard
 
 RECORD = "exports.json"
 _LOCK, _PART, _OLD = ".lock", ".part", ".old"
 _ALWAYS = ("scanloom", "numpy", "pyproj", "pyarrow")
 
-log = logging.getLogger(__name__)
-
 Row = dict[str, Any]
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -71,20 +72,44 @@ def options_of(**fields: Any) -> Options:
 
 
 def export_map(folder: Path, names: str, options: Options, out: Path | None = None) -> list[Exported]:
+    """As `export_all`, and the first failure is raised when all formats are through."""
+    done, failures = export_all(folder, names, options, out)
+    for _, error in failures:
+        raise error
+    return done
+
+
+def export_all(
+    folder: Path, names: str, options: Options, out: Path | None = None, progress: Progress | None = None
+) -> tuple[list[Exported], list[tuple[str, ScanloomError]]]:
     """Export a map to formats separated by commas; one whose files are there and were made from this very map is left alone.
+
+    Returns what was exported, and of each format that failed its name and why: one that fails stops no other.
 
     Raises
     ------
-    InvalidInput : the folder holds no map, or none that can be exported so.
+    InvalidInput : the folder holds no map, or none that has a place in the system asked for.
     UsageError : a format or option does not exist, or its library is not installed.
     StoreError : the folder of the exports cannot be written.
     """
-    formats = formats_of(names)
+    formats = sorted(formats_of(names), key=_order)
     source = MapSource.open(folder)
     Projector.of(source, options)
     place = out or folder / "exports"
-    with _alone_in(place):
-        return [_export(source, entry, options, place) for entry in sorted(formats, key=_order)]
+    heard = Heard(progress or Silent(), formats, len(part_names(source, options)))
+    done, failures = [], []
+    with _alone_in(place), heard:
+        for entry in formats:
+            try:
+                done.append(_export(heard.listening(source, entry), entry, options, place))
+            except ScanloomError as error:
+                failures.append((entry.name, error))
+            except Exception as error:
+                log.exception("export %s", entry.name)
+                failures.append((entry.name, ScanloomError(f"{type(error).__name__}: {error}")))
+            else:
+                heard.over(entry, done[-1].fresh)
+    return done, failures
 
 
 def _order(entry: Format) -> bool:
@@ -130,7 +155,6 @@ def _export(source: MapSource, entry: Format, options: Options, place: Path) -> 
     known = read_record(place).get(entry.name, {})
     if known.get("made_from") == made_from and _as_recorded(folder, known):
         return Exported(entry.name, folder, known, fresh=False)
-    log.info("exporting %s: %s", entry.name, entry.doc)
     try:
         files = _write_beside(source, entry, options, folder)
     except OSError as error:

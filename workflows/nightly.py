@@ -60,8 +60,11 @@ def run_fleet(
     noise = read_noise(fleet_file.parent / fleet.noise) if fleet.noise else None
     folder = out or fleet_file.parent / fleet.out
     last_night = _read_summary(folder / SUMMARY_FILE)
-    rows = []
-    for name, sessions in sessions_by_map(fleet, fleet_file.parent).items():
+    rows: list[dict[str, Any]] = []
+    maps = sessions_by_map(fleet, fleet_file.parent)
+    started = time.monotonic()
+    for name, sessions in maps.items():
+        _say_how_far(name, len(rows), len(maps), time.monotonic() - started)
         order = _order(name, sessions, fleet, folder, store)
         order = dataclasses.replace(order, cluster=cluster, workers=workers)
         before = as_it_was(order.out) if fleet.gate else None
@@ -76,6 +79,12 @@ def run_fleet(
     failures = [f"{row['map']}: {failure}" for row in rows for failure in row["failures"]]
     worse = [f"{row['map']}: {text}" for row in rows for text in row["regressions"]]
     return Night(folder / PAGE_FILE, summary, failures, worse, _exit_code(rows))
+
+
+def _say_how_far(name: str, made: int, maps: int, passed_s: float) -> None:
+    """With the time left, when the maps to come take as long as those before."""
+    left = f", about {passed_s / made * (maps - made) / 60.0:.0f} min left" if made else ""
+    log.info("map %d of %d: %s%s", made + 1, maps, name, left)
 
 
 def _order(name: str, sessions: list[str], fleet: Fleet, folder: Path, store: Path) -> Order:

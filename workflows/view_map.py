@@ -6,13 +6,22 @@ import threading
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from scanloom.workflows.viewer.answers import Answers
 from scanloom.workflows.viewer.server import Server
 
 
-def view_map(folder: Path, port: int, browser: bool, say: Callable[[str], None]) -> None:
+def view_map(
+    folder: Path,
+    port: int,
+    browser: bool,
+    say: Callable[[str], None],
+    tell: Callable[[dict[str, Any]], None] | None = None,
+) -> None:
     """Serve a map until the user stops it.
+
+    tell : is given the address for a machine, instead of a line for `say`.
 
     Raises
     ------
@@ -21,7 +30,10 @@ def view_map(folder: Path, port: int, browser: bool, say: Callable[[str], None])
     """
     answers = Answers(folder)
     with Server(port, answers) as server:
-        say(f"{folder}: {server.url}   stop with Ctrl-C")
+        if tell is not None:
+            tell({"map": str(folder), "url": server.url, "points": answers.source.points})
+        else:
+            say(f"{folder}: {server.url}   stop with Ctrl-C")
         threading.Thread(target=answers.prepare, daemon=True).start()
         if browser:
             threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()

@@ -82,6 +82,7 @@ def clouds(source: MapSource, projector: Projector, options: Options) -> Iterato
 def cloud_of(source: MapSource, projector: Projector, name: str) -> Cloud:
     """One of `part_names`, placed."""
     tile = part(source, name)
+    source.passed()
     return Cloud(name, projector.tile(tile), tile, projector.axes(tile.offset_m))
 
 

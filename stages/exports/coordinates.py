@@ -130,14 +130,23 @@ class Projector:
         return {"description": self._transformer.description, "accuracy_m": self._transformer.accuracy}
 
     def project(self, points: ArrayLike) -> F8:
-        """x, y, height (n, 3) of points (n, 3) of the map's frame, m; exact."""
+        """x, y, height (n, 3) of points (n, 3) of the map's frame, m; exact.
+
+        Raises
+        ------
+        UsageError : the map reaches beyond what the system or its grid covers.
+        """
+        from pyproj.exceptions import ProjError
+
         p = np.asarray(points, float).reshape(-1, 3)
         if self.georeference is None:
             return p.copy()
         geodetic = world_to_geodetic(self.georeference, p)
-        return np.column_stack(
-            self._transformer.transform(geodetic[:, 1], geodetic[:, 0], geodetic[:, 2], errcheck=True)
-        )
+        try:
+            found = self._transformer.transform(geodetic[:, 1], geodetic[:, 0], geodetic[:, 2], errcheck=True)
+        except ProjError as error:
+            raise _outside(self, error) from error
+        return np.column_stack(found)
 
     def tile(self, tile: Tile) -> F8:
         """x, y, height (n, 3) of the points of a tile, to `TOLERANCE_M`."""
@@ -281,14 +290,28 @@ def _compound(epsg: int, vertical_epsg: int) -> Any:
     return CRS(f"EPSG:{epsg}+{vertical_epsg}")
 
 
+def _outside(projector: Projector, error: Exception) -> UsageError:
+    origin = projector.georeference
+    place = f" near {origin.latitude_deg:.3f}, {origin.longitude_deg:.3f}" if origin else ""
+    target = f"EPSG:{projector.epsg}" + (f"+{projector.vertical_epsg}" if projector.vertical_epsg else "")
+    return UsageError(
+        f"PROJ cannot convert points of the map{place} into {target}: {error}",
+        next_step="take a system whose area and grid cover the map, or --heights ellipsoidal",
+    )
+
+
 def _grid_is_missing(projector: Projector, operations: list[Any]) -> UsageError:
     from pyproj.datadir import get_user_data_dir  # type: ignore[attr-defined]
 
     grids = [grid for grid in operations[0].grids if not grid.available] if operations else []
     names = ", ".join(grid.short_name for grid in grids) or "one that PROJ does not name"
     target = f"EPSG:{projector.epsg}" + (f"+{projector.vertical_epsg}" if projector.vertical_epsg else "")
+    sync = "; ".join(f"pyproj sync --file {grid.short_name}" for grid in grids) or "pyproj sync --help"
     where = " and ".join(grid.url for grid in grids if grid.url) or "https://cdn.proj.org"
     return UsageError(
         f"the way from WGS84 to {target} needs a grid that is not installed: {names}",
-        next_step=f"put it into {get_user_data_dir()} (from {where})",
+        next_step=(
+            f"run `{sync}` where there is a network, or put it into {get_user_data_dir()} (from {where}); "
+            "--heights ellipsoidal needs no grid"
+        ),
     )

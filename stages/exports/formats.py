@@ -47,6 +47,8 @@ class Format:
     """Modules that are not part of every installation."""
     cloud: bool = False
     """Whether it holds every point of the map, and with `removed` those that are left out."""
+    passes: int = 1
+    """How often it reads the tiles of the map; 0 when it needs none."""
     lists_others: bool = False
     """Made from the other exports beside it, hence written after them."""
     version: int = 1
@@ -79,25 +81,32 @@ _ROWS: tuple[Format, ...] = (
         cloud=True,
     ),
     Format("3dtiles", "whole map as 3D Tiles 1.1 with glTF contents, on the globe", write_3d_tiles),
-    Format("tum", "trajectory as text of TUM, in the map's frame", write_tum),
+    Format("tum", "trajectory as text of TUM, in the map's frame", write_tum, passes=0),
     Format(
-        "kitti", "trajectory as text of KITTI: 3 x 4 matrices of the LiDAR, in the map's frame", write_kitti
+        "kitti",
+        "trajectory as text of KITTI: 3 x 4 matrices of the LiDAR, in the map's frame",
+        write_kitti,
+        passes=0,
     ),
-    Format("gpx", "trajectory as GPX 1.1", write_gpx),
-    Format("geojson", "trajectory as GeoJSON", write_geojson),
+    Format("gpx", "trajectory as GPX 1.1", write_gpx, passes=0),
+    Format("geojson", "trajectory as GeoJSON", write_geojson, passes=0),
     Format(
         "geoparquet",
         "trajectory as GeoParquet 1.1, a row per scan with standard deviations",
         write_geoparquet,
+        passes=0,
     ),
     Format("dem", "heights of the ground as GeoTIFF", write_dem, "raster", ("rasterio",)),
-    Format("orthophoto", "intensity from above as GeoTIFF", write_orthophoto, "raster", ("rasterio",)),
+    Format(
+        "orthophoto", "intensity from above as GeoTIFF", write_orthophoto, "raster", ("rasterio",), passes=2
+    ),
     Format(
         "stac",
         "catalogue item of the map and all its exports",
         write_stac,
         "stac",
         ("pystac",),
+        passes=0,
         lists_others=True,
     ),
 )

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,8 @@ class MapSource:
     header: dict[str, Any]
     """Content of `map.json`."""
     index: TileIndex
+    passed: Callable[[], None] = field(default=lambda: None, compare=False)
+    """Called whenever a writer goes on to another tile, so that somebody can say how far it is."""
 
     @classmethod
     def open(cls, folder: Path) -> MapSource:
@@ -65,6 +67,7 @@ class MapSource:
         """Tile after tile, by name."""
         for name in self.tile_names:
             yield name, self.tile(name)
+            self.passed()
 
     @property
     def points(self) -> int:

@@ -38,6 +38,7 @@ def write_3d_tiles(source: MapSource, folder: Path, options: Options) -> list[Pa
             written.append(_write_json(folder / path_of(node), tile_tileset(node, tops)))
             inside = (below for top in tops for below in top.walk() if below.points)
             written += [_write_content(folder, reader, below) for below in inside]
+            source.passed()
     return written
 
 

@@ -40,3 +40,19 @@ def test_bars_on_a_terminal(tmp_path, store):
     assert isinstance(progress_for(io.StringIO()), Lines)
     run(request(log(tmp_path, "a", range(30))), store, cluster="none", progress=progress)
     assert "survey" in terminal.getvalue()
+
+
+def test_long_stages_are_said_with_the_time_left(caplog, monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr("scanloom.pipeline.progress.time.monotonic", lambda: clock[0])
+    lines = Lines(every_s=30.0)
+    with caplog.at_level(logging.INFO, logger="scanloom.progress"):
+        lines.begin([("laz", "laz (a cloud)")])
+        for over in range(40):
+            lines.update({"laz": (over, 1, 40)})
+            clock[0] += 5.0
+        lines.update({"laz": (40, 0, 40)})
+    said = [record.getMessage() for record in caplog.records]
+    assert said[0] == "  35.0 s  laz (a cloud): 7 of 40, about 165 s left"
+    assert said[-1] == " 200.0 s  laz (a cloud): 40 of 40"
+    assert len(said) == 6

@@ -17,8 +17,9 @@ import pytest
 from scanloom.schemas.errors import InvalidInput, ProductError, StoreError, UsageError
 from scanloom.stages.exports import formats
 from scanloom.stages.exports.options import Options
-from scanloom.workflows.export_map import export_map, options_of, read_record
+from scanloom.workflows.export_map import export_all, export_map, options_of, read_record
 from tests.stages.exports.clouds import scattered, write
+from tests.stages.exports.tracks import MUNICH, poses_along, way
 
 
 @pytest.fixture
@@ -238,10 +239,87 @@ def test_after_a_map(folder: Path) -> None:
     outcome = Outcome(
         out=folder, exit_code=0, delivered=True, metrics=[], executed=1, warnings=[], failures=[]
     )
-    assert _export_after(outcome, "") == []
-    assert [entry.name for entry in _export_after(outcome, "pcd,ply")] == ["pcd", "ply"]
-    assert _export_after(replace(outcome, delivered=False), "laz") == []
+    assert _export_after(outcome, "") == (outcome, [])
+    after, done = _export_after(outcome, "pcd,ply")
+    assert [entry.name for entry in done] == ["pcd", "ply"] and after == outcome
+    failed = replace(outcome, delivered=False)
+    assert _export_after(failed, "laz") == (failed, [])
     assert not (folder / "exports/laz").exists()
+
+
+def full_disk(source, place: Path, options) -> list[Path]:
+    (place / "half").write_bytes(b"half")
+    raise OSError(28, "No space left on device")
+
+
+def surprise(source, place: Path, options) -> list[Path]:
+    raise ZeroDivisionError("float division by zero")
+
+
+@pytest.mark.parametrize(("breaks", "why"), [(full_disk, "No space left"), (surprise, "ZeroDivisionError")])
+def test_one_that_fails_stops_no_other(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, breaks, why: str
+) -> None:
+    from scanloom.workflows.build_map import Outcome
+    from scanloom.workflows.export_after import export_after
+
+    broken = replace(formats.FORMATS["ply"], write=breaks)
+    monkeypatch.setattr(formats, "FORMATS", dict(formats.FORMATS) | {"ply": broken})
+    outcome = Outcome(
+        out=folder, exit_code=0, delivered=True, metrics=[], executed=1, warnings=[], failures=[]
+    )
+    after, done = export_after(outcome, "ply,pcd")
+    assert [entry.name for entry in done] == ["pcd"] and after.exit_code == 3 and after.delivered
+    assert [(where, why in str(error)) for where, error in after.failures] == [("export ply", True)]
+    assert sorted(p.name for p in (folder / "exports").iterdir()) == [".lock", "exports.json", "pcd"]
+
+
+class Notes:
+    """Progress that remembers."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[str, int, int, int]] = []
+        self.ended = 0
+
+    def begin(self, stages) -> None:
+        self.titles = dict(stages)
+
+    def update(self, counts) -> None:
+        self.told += [(name, *row) for name, row in counts.items()]
+
+    def note(self, text: str) -> None: ...
+
+    def end(self) -> None:
+        self.ended += 1
+
+
+@pytest.mark.parametrize(
+    "name", ["ply", "pcd", "laz", "copc", "autoware", "3dtiles", "dem", "orthophoto", "tum"]
+)
+def test_progress_counts_tiles(folder: Path, name: str) -> None:
+    entry = formats.FORMATS[name]
+    for module in entry.needs:
+        pytest.importorskip(module)
+    write_track(folder)
+    heard = Notes()
+    _, failures = export_all(folder, name, Options(), progress=heard)
+    assert failures == [] and heard.ended == 1 and name in heard.titles[name]
+    tiles = len(list((folder / "tiles").glob("*_*.parquet")))
+    over = [row[1] for row in heard.told]
+    total = max(entry.passes * tiles, 1)
+    assert {row[3] for row in heard.told} == {total} and over == sorted(over)
+    assert heard.told[0] == (name, 0, 1, total) and heard.told[-1] == (name, total, 0, total)
+    if entry.passes:
+        assert len(set(over)) > tiles // 2 or name == "3dtiles", "a small map is one file of 3D Tiles"
+    before = len(heard.told)
+    export_all(folder, name, Options(), progress=heard)
+    assert heard.told[before:] == [(name, 0, 1, total)], "what is unchanged is not said to be done"
+
+
+def write_track(folder: Path) -> None:
+    along = way(4)
+    (folder / "trajectory").mkdir(exist_ok=True)
+    poses_along(along, MUNICH).write(folder / "trajectory/a.parquet")
 
 
 def test_trajectories_have_no_points_on_record(folder: Path) -> None:

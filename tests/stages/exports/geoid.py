@@ -14,22 +14,25 @@ UNDULATION_M = 47.25
 
 
 @contextmanager
-def made_up_egm96(folder: Path) -> Iterator[None]:
-    """PROJ finds a grid of one undulation as long as this lasts."""
+def made_up_egm96(folder: Path, west_deg: float = -180.5, columns: int = 361) -> Iterator[None]:
+    """PROJ finds a grid of one undulation as long as this lasts; the whole Earth, or what lies east of `west_deg`.
+
+    Its columns are one degree wide, their middles half a degree from the edges.
+    """
     import rasterio
     from rasterio.transform import from_origin
 
     path = folder / "us_nga_egm96_15.tif"
     with rasterio.open(
-        path, "w", driver="GTiff", width=361, height=181, count=1, dtype="float32", crs="EPSG:4326",
-        transform=from_origin(-180.5, 90.5, 1.0, 1.0),
+        path, "w", driver="GTiff", width=columns, height=181, count=1, dtype="float32", crs="EPSG:4326",
+        transform=from_origin(west_deg, 90.5, 1.0, 1.0),
     ) as grid:  # fmt: skip
         grid.update_tags(
             AREA_OR_POINT="Point", TYPE="VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL", target_crs_epsg_code="5773"
         )
         grid.set_band_description(1, "geoid_undulation")
         grid.set_band_unit(1, "metre")
-        grid.write(np.full((181, 361), UNDULATION_M, np.float32), 1)
+        grid.write(np.full((181, columns), UNDULATION_M, np.float32), 1)
     before = pyproj.datadir.get_data_dir()
     pyproj.datadir.append_data_dir(str(folder))
     try:
