@@ -61,6 +61,43 @@ class Camera(_Entry):
     """From the first row to the last of a rolling shutter, 0 for a global one; an image's stamp is its middle."""
 
 
+Agreement = Literal["agrees", "moved", "unknown"]
+"""`unknown`: images and reflectance say too little of each other, or too little was seen."""
+
+
+class CameraAgreement(_Entry):
+    """How well what one camera saw agrees with what the LiDAR measured there."""
+
+    camera: str
+    verdict: Agreement = "unknown"
+    images: int = 0
+    """Images that were compared."""
+    points: int = 0
+    nid: float = float("nan")
+    """Normalised information distance of reflectance and grey as calibrated: 0 one tells the other, 1 they are unrelated."""
+    nid_best: float = float("nan")
+    """The same where the camera fits best."""
+    offset_deg: tuple[float, float, float] = (float("nan"),) * 3
+    """Turn about the camera's own x, y, z that `T_lidar_camera` lacks: the camera fits best at T Exp(offset)."""
+    std_deg: tuple[float, float, float] = (float("nan"),) * 3
+    """Of the offset, from its spread when parts of the images are left out."""
+    remark: str = ""
+    """What was found, in a sentence."""
+
+    @property
+    def turned_deg(self) -> float:
+        """Size of the offset."""
+        return float(np.linalg.norm(self.offset_deg))
+
+
+class CameraCheck(Document):
+    """The cameras of a session held against the reflectance of its scans, without a target."""
+
+    NAME: ClassVar[str] = "camera_check"
+
+    cameras: tuple[CameraAgreement, ...] = ()
+
+
 class Footage(_Entry):
     """What of a camera's images is used."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from scanloom.pipeline.node import Node, node
 from scanloom.schemas.base import Base, BaseLog
-from scanloom.schemas.cameras import Cameras, Images
+from scanloom.schemas.cameras import CameraCheck, Cameras, Images
 from scanloom.schemas.changes import ChangeFiles, Changes
 from scanloom.schemas.clean import ClassCounts, Cleared, FinalLabels, Rays
 from scanloom.schemas.evaluation import ErrorTrack, Metrics, PictureFiles, ReportFiles
@@ -19,6 +19,7 @@ from scanloom.schemas.tracks import Gnss, Imu, Wheel
 from scanloom.schemas.trajectory import Odometry, Poses, Truth
 from scanloom.schemas.windows import Track, TrackEnds, Window
 from scanloom.stages.base import base
+from scanloom.stages.camera_check import camera_check
 from scanloom.stages.changes import changes
 from scanloom.stages.clean import clean, rays, relabel
 from scanloom.stages.denoise import denoise
@@ -55,6 +56,7 @@ NODES: tuple[Node, ...] = (
     node("windows",    windows,    per="session", reads=(Scans,),                              writes=Window, settings="odometry"),
     node("track",      track,      per="window",  reads=(Window, Deskewed, Labels, Session, Imu, Wheel, SensorCheck), writes=(Track, TrackEnds), settings="odometry"),
     node("odometry",   odometry,   per="session", reads=(Deskewed, Labels, Session, Imu, Wheel, SensorCheck, Track, TrackEnds), writes=Odometry),
+    node("camera_check", camera_check, per="session", reads=(Images, Cameras, Deskewed, Labels, Odometry), writes=CameraCheck),
     node("objects",    objects,    per="session", reads=(Deskewed, Labels, Session, Odometry), writes=ObjectTracks),
     node("places",     places,     per="chunk",   reads=(Deskewed, Labels, Odometry),          writes=Places),
     node("loops",      loops,      per="map",     reads=(Deskewed, Labels, Odometry, Places),  writes=Loops),
@@ -66,8 +68,8 @@ NODES: tuple[Node, ...] = (
     node("changes",    changes,    per="map",     reads=(Base, Poses, Deskewed, FinalLabels, Piece), writes=(Changes, ChangeFiles)),
     node("tiles",      tiles,      per="tile",    reads=(Piece,),                              writes=(Tile, RemovedTile, TileFiles)),
     node("overview",   overview,   per="map",     reads=(Tile, RemovedTile),                   writes=(TileIndex, Overview, MapFiles)),
-    node("evaluation", evaluation, per="map",     reads=(Session, Truth, Odometry, Poses, Loops, Graph, Gnss, Tile, SensorCheck, ClassCounts, RemovedTile), writes=(Metrics, ErrorTrack)),
+    node("evaluation", evaluation, per="map",     reads=(Session, Truth, Odometry, Poses, Loops, Graph, Gnss, Tile, SensorCheck, ClassCounts, RemovedTile, CameraCheck), writes=(Metrics, ErrorTrack)),
     node("picture",    picture,    per="map",     reads=(Poses, Loops, Graph, TileIndex, Tile, RemovedTile), writes=PictureFiles),
-    node("report",     report,     per="map",     reads=(Session, Metrics, ErrorTrack, Odometry, Poses, Loops, Graph, TileIndex, PictureFiles, SensorCheck, Changes, ObjectTracks, ClassCounts, Cameras), writes=ReportFiles),
+    node("report",     report,     per="map",     reads=(Session, Metrics, ErrorTrack, Odometry, Poses, Loops, Graph, TileIndex, PictureFiles, SensorCheck, Changes, ObjectTracks, ClassCounts, Cameras, CameraCheck), writes=ReportFiles),
 )
 # fmt: on

@@ -32,6 +32,7 @@ from dataclasses import dataclass
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from scanloom.schemas.cameras import CameraCheck
 from scanloom.schemas.clean import ClassCounts
 from scanloom.schemas.evaluation import ErrorTrack, Metrics
 from scanloom.schemas.loops import Loops
@@ -51,7 +52,7 @@ from scanloom.stages.evaluation.paths import TruePath, true_paths
 from scanloom.stages.evaluation.removed import count_figures
 from scanloom.stages.evaluation.revisits import revisits
 from scanloom.stages.evaluation.search import search_figures
-from scanloom.stages.evaluation.sensors import sensor_figures
+from scanloom.stages.evaluation.sensors import camera_figures, sensor_figures
 from scanloom.stages.evaluation.sessions import session_figures
 from scanloom.stages.evaluation.survey import Manner
 from scanloom.stages.evaluation.trajectories import error_track, trajectory_figures, truth_figures
@@ -99,6 +100,7 @@ def evaluation(
     check: Parts[SensorCheck] | None = None,
     counts: Parts[ClassCounts] | None = None,
     removed: Parts[RemovedTile] | None = None,
+    cameras: Parts[CameraCheck] | None = None,
 ) -> Iterator[Part[ErrorTrack] | Metrics]:
     """Yield the error track of every session with truth, then the metrics of all sessions and of the map.
 
@@ -110,10 +112,12 @@ def evaluation(
     truths = {name: t for name, t in given.truths.items() if len(t)}
     fixes = fix_rows(graph)
     by_name = {} if counts is None else counts.by("session")
+    cameras_of = _by_session(cameras)
     figures: list[Figure] = []
     for name in sorted(given.odometries.keys() & given.poses.keys()):
         figures += _of(name, _session_figures(name, given, fixes))
         figures += _of(name, count_figures(by_name.get(name, ())))
+        figures += _of(name, camera_figures(cameras_of.get(name, CameraCheck())))
         if name in truths:
             track = error_track(truths[name], given.odometries[name], given.poses[name])
             if track is not None:

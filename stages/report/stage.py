@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from scanloom.schemas.cameras import Cameras
+from scanloom.schemas.cameras import CameraCheck, Cameras
 from scanloom.schemas.changes import Changes
 from scanloom.schemas.clean import ClassCounts
 from scanloom.schemas.evaluation import ErrorTrack, Metrics, PictureFiles, ReportFiles
@@ -97,6 +97,7 @@ def report(
     objects: Parts[ObjectTracks] | None = None,
     counts: Parts[ClassCounts] | None = None,
     cameras: Parts[Cameras] | None = None,
+    camera_check: Parts[CameraCheck] | None = None,
 ) -> ReportFiles:
     """Judge the map and write the body of the report, to be wrapped by `page.compose`."""
     sessions, paths, odometries = by_session(session), by_session(poses), by_session(odometry)
@@ -115,6 +116,7 @@ def report(
         sessions=sessions,
         checks=by_session(check),
         cameras=by_session(cameras),
+        agreements=by_session(camera_check),
         names=list(paths),
         **_pictures(picture),
         out_rows=out_rows(list(sessions), figures),

@@ -11,6 +11,7 @@ import pytest
 
 from scanloom.pipeline.node import Node
 from scanloom.pipeline.task import imported
+from scanloom.schemas.cameras import Cameras
 from scanloom.schemas.errors import ScanloomError
 from scanloom.schemas.product import Document, Files, Part, Parts, Product, Stream, Table, attributes_of
 from scanloom.schemas.rig import SensorCheck
@@ -29,6 +30,7 @@ CONTENT_WITH_NOTHING = {
     "base",
     "changes",
     "images",
+    "camera_check",
     "truth",
     "overview",
     "tiles",
@@ -154,8 +156,8 @@ def _nothing(product: type[Product]) -> Product:
         return product()
     if issubclass(product, Stream):
         return product([])
-    if product is SensorCheck:
-        return SensorCheck()
+    if product in (SensorCheck, Cameras):
+        return product()
     if product is Window:
         return Window(first=0, own=0, last=0)
     if issubclass(product, Document):

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scanloom.schemas.cameras import Camera, CameraModel, Cameras, Footage
+from scanloom.schemas.cameras import Camera, CameraAgreement, CameraCheck, CameraModel, Cameras, Footage
 from scanloom.schemas.evaluation import ErrorTrack, Metrics, ReportFiles
 from scanloom.schemas.loops import Loops
 from scanloom.schemas.pose_graph import Graph
@@ -294,7 +294,10 @@ def test_cameras_are_listed(street_map: Map) -> None:
     assert all(
         text in page for text in ("cam_front", "1920 x 1208", "equidistant", "240", '"pill warning">unknown')
     )
-    bare = body(street_map.report(cameras=one(Cameras())))
+    agreement = CameraAgreement(camera="cam_front", verdict="moved", remark="Camera <front> has turned.")
+    page = body(street_map.report(camera_check=one(CameraCheck(cameras=(agreement,)))))
+    assert '<span class="pill error">cameras</span> Camera &lt;front&gt; has turned.' in page
+    bare = body(street_map.report(cameras=one(Cameras()), camera_check=one(CameraCheck())))
     assert bare == body(street_map.report())
 
 

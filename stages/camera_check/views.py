@@ -1,0 +1,156 @@
+"""What is compared: for each of a few dozen images the points of the scans around it, as the camera should see them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanloom.schemas.cameras import Camera, CameraModel, Image, Images
+from scanloom.schemas.errors import StageError
+from scanloom.schemas.product import Parts
+from scanloom.schemas.scans import Deskewed, Labels, PointClass
+from scanloom.schemas.trajectory import Odometry
+from scanloom.stages.geometry.camera import project
+from scanloom.stages.geometry.interpolation import inside, interpolate_poses
+from scanloom.stages.geometry.pictures import decode, grey
+from scanloom.stages.geometry.se3 import F8, inverse, transform
+
+U1 = NDArray[np.uint8]
+WIDTH_PX = 640
+"""Images are made smaller, to no less than this: half a degree stays several pixels."""
+NEAR_M, FAR_M = 2.0, 60.0
+"""Nearer the camera sees what the LiDAR beside it does not; further away a point covers much of the picture."""
+CELLS = 160
+"""Across the image, for telling what stands before what."""
+BEHIND, BEHIND_M = 1.05, 0.3
+"""A point so much further than the nearest in its cell or those around it may be hidden from the camera."""
+STANDING = (PointClass.UNLABELLED, PointClass.GROUND, PointClass.STATIC)
+
+
+@dataclass(frozen=True)
+class View:
+    """One image and the points that should be seen in it."""
+
+    stamp_ns: int
+    pixels: U1
+    """Grey (h, w), made smaller."""
+    model: CameraModel
+    """Of the smaller image."""
+    points: F8
+    """(n, 3) in the camera's axes as calibrated, m."""
+    intensity: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Footing:
+    """The scans of a session and where they stand."""
+
+    deskewed: Sequence[Deskewed]
+    labels: Sequence[Labels]
+    stamp_ns: NDArray[np.int64]
+    place: NDArray[np.int64]
+    """(n, 2): chunk and number in it, of each scan."""
+    path: Odometry
+
+
+def footing(deskewed: Parts[Deskewed], labels: Parts[Labels], path: Odometry) -> Footing:
+    """Where each scan lies, without reading one."""
+    chunks = list(deskewed)
+    rows = [
+        (int(item["reference_ns"]), c, i)
+        for c, chunk in enumerate(chunks)
+        for i, item in enumerate(chunk.index)
+    ]
+    table = np.array(sorted(rows), np.int64).reshape(-1, 3)
+    return Footing(chunks, list(labels), table[:, 0], table[:, 1:], path)
+
+
+def moments(images: Parts[Images], camera: str, count: int) -> list[tuple[int, int, int]]:
+    """(stamp, part, number) of `count` images of a camera, spread over the session."""
+    found = [
+        (int(item["stamp_ns"]), p, i)
+        for p, part in enumerate(images)
+        for i, item in enumerate(part.index)
+        if item["camera"] == camera
+    ]
+    if len(found) <= count:
+        return found
+    return [found[i] for i in np.linspace(0, len(found) - 1, count).round().astype(int)]
+
+
+def view(camera: Camera, image: Image, ground: Footing, scans: int, points: int) -> View | None:
+    """The image with at most `points` points of the `scans` scans nearest in time; None where the path is not known."""
+    nearest = _nearest(ground, image.stamp_ns, scans)
+    if camera.T_lidar_camera is None or not len(nearest):
+        return None
+    try:
+        pixels, model = smaller(grey(decode(image)), camera.model)
+    except StageError:
+        return None
+    T_odom = interpolate_poses(ground.path.stamp_ns, ground.path.T_odom_lidar, _stamps(image.stamp_ns))[0]
+    clouds = [_standing(ground, k, inverse(T_odom)) for k in nearest]
+    xyz = np.concatenate([cloud for cloud, _ in clouds])
+    intensity = np.concatenate([values for _, values in clouds])
+    xyz = transform(inverse(np.array(camera.T_lidar_camera)), xyz)
+    rows = visible(model, xyz)
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), points)).astype(int)] if len(rows) else rows
+    return View(image.stamp_ns, pixels, model, xyz[rows], intensity[rows])
+
+
+def smaller(pixels: U1, model: CameraModel) -> tuple[U1, CameraModel]:
+    """An image and its model, both made smaller by a whole number."""
+    import cv2
+
+    step = max(pixels.shape[1] // WIDTH_PX, 1)
+    height, width = pixels.shape[0] // step, pixels.shape[1] // step
+    if step == 1:
+        return pixels, model
+    small = cv2.resize(pixels[: height * step, : width * step], (width, height), interpolation=cv2.INTER_AREA)
+    changes = {
+        "width_px": width, "height_px": height, "fx_px": model.fx_px / step, "fy_px": model.fy_px / step,
+        "cx_px": (model.cx_px + 0.5) / step - 0.5, "cy_px": (model.cy_px + 0.5) / step - 0.5,
+    }  # fmt: skip
+    return np.asarray(small, np.uint8), model.model_copy(update=changes)
+
+
+def visible(model: CameraModel, xyz: F8) -> NDArray[np.int64]:
+    """Rows of the points in the image that nothing nearer hides, as far as the points themselves tell."""
+    pixels, seen = project(model, xyz)
+    far = np.linalg.norm(xyz, axis=1)
+    rows = np.flatnonzero(seen & (far > NEAR_M) & (far < FAR_M))
+    size = model.width_px / CELLS
+    u, v = ((pixels[rows] + 0.5) / size).astype(np.int64).T
+    down = int(model.height_px / size) + 1
+    nearest = np.full((down + 2, CELLS + 3), np.inf)
+    np.minimum.at(nearest, (v + 1, u + 1), far[rows])
+    around = np.min(
+        [nearest[1 + i : down + 1 + i, 1 + j : CELLS + 2 + j] for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0
+    )
+    return np.asarray(rows[far[rows] < BEHIND * around[v, u] + BEHIND_M], np.int64)
+
+
+def _nearest(ground: Footing, stamp_ns: int, scans: int) -> NDArray[np.int64]:
+    """Scans of the same stretch of the path as the image; none where the path does not reach or is bridged."""
+    path = ground.path
+    if not len(ground.stamp_ns) or not inside(path.stamp_ns, _stamps(stamp_ns))[0]:
+        return np.empty(0, np.int64)
+    order = np.argsort(np.abs(ground.stamp_ns - stamp_ns), kind="stable")[:scans]
+    row = np.searchsorted(path.stamp_ns, np.append(ground.stamp_ns[order], stamp_ns)).clip(0, len(path) - 1)
+    whole = len(np.unique(path.segment[row])) == 1 and bool(path.reliable[row].all())
+    return np.asarray(order[: len(order) if whole else 0], np.int64)
+
+
+def _standing(ground: Footing, k: int, T_image_odom: F8) -> tuple[F8, NDArray[np.float32]]:
+    """Points of scan `k` that do not move, in the LiDAR's axes at the time of the image."""
+    chunk, number = ground.place[k]
+    scan, labels = ground.deskewed[chunk][number], ground.labels[chunk][number]
+    keep = np.isin(labels.class_, STANDING)
+    at = interpolate_poses(ground.path.stamp_ns, ground.path.T_odom_lidar, _stamps(scan.reference_ns))[0]
+    return transform(T_image_odom @ at, scan.points()[keep].astype(float)), scan.intensity[keep]
+
+
+def _stamps(stamp_ns: int) -> NDArray[np.int64]:
+    return np.array([stamp_ns], np.int64)
