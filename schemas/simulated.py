@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from scanloom.schemas.product import Table, column
+from scanloom.schemas.product import Stream, Table, attribute, column
 
 
 class Lie(IntEnum):
@@ -79,3 +79,25 @@ class TrueTracks(Table):
     width_m: NDArray[np.float64] = column("f8", "size along its own y", unit="m")
     height_m: NDArray[np.float64] = column("f8", "size upwards from the ground", unit="m")
     speed_m_s: NDArray[np.float64] = column("f8", "speed over ground", unit="m/s")
+
+
+@dataclass(frozen=True)
+class TruePaint(Table):
+    """What colour every point of one simulated scan has, in the order of the message."""
+
+    NAME: ClassVar[str] = "true_paint"
+
+    albedo: NDArray[np.uint8] = column(
+        "u1", "red, green, blue (sRGB): what an image shows of it in white light of strength 1", shape=(3,)
+    )
+    lit: NDArray[np.uint8] = column(
+        "u1", "1 where the sun shines on it, 0 in shadow; moving things cast none"
+    )
+    scan_index: int = attribute("number of the scan in its session, from 0")
+
+
+class TrueColours(Stream[TruePaint]):
+    """The colours of a simulated session's points; only with cameras."""
+
+    NAME = "true_colours"
+    ITEM = TruePaint

@@ -9,13 +9,18 @@ from typing import IO
 import numpy as np
 
 from scanloom.schemas.scans import TrueLabels, TruePoints
+from scanloom.schemas.simulated import TrueColours, TruePaint
 from scanloom.schemas.trajectory import Truth
 from scanloom.stages.geometry.geodesy import georeference
 from scanloom.stages.simulate.busy import build_guests, giving_way
+from scanloom.stages.simulate.cameras import NAMES, optical, told_mounts, true_cameras
 from scanloom.stages.simulate.estate import build_estate
+from scanloom.stages.simulate.footage import Footage
 from scanloom.stages.simulate.gnss import GnssTrack, gnss_track
 from scanloom.stages.simulate.motion import Motion, build_motion
-from scanloom.stages.simulate.recording import Recorder, entries
+from scanloom.stages.simulate.paints import Paints
+from scanloom.stages.simulate.pictures import camera_entries, camera_topics
+from scanloom.stages.simulate.recording import TYPES, Recorder, entries
 from scanloom.stages.simulate.rig import T_BASE
 from scanloom.stages.simulate.route import build_path, ring
 from scanloom.stages.simulate.settings import Settings
@@ -34,8 +39,9 @@ class Drive:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self._recorder = Recorder()
+        self._recorder = Recorder({**TYPES, **camera_topics(settings)})
         self._labels: list[list[bytes]] = []
+        self._colours: list[list[bytes]] = []
         self._motion: Motion | None = None
         self._gnss: GnssTrack | None = None
         self._town_driven: Town | None = None
@@ -47,15 +53,17 @@ class Drive:
         path = town.path
         motion = build_motion(s, path)
         movers = self._movers_of(town, motion)
-        lidar = Lidar(s, town, motion, movers, build_weather(s, path, motion, movers))
+        footage = Footage(s, town, motion, movers, Paints(s.town_seed)) if s.cameras else None
+        lidar = Lidar(s, town, motion, movers, build_weather(s, path, motion, movers), footage)
         gnss_settings = s if s.gnss else s.model_copy(update={"duration_s": 0.0})
         gnss = gnss_track(gnss_settings, motion, scene_of(town.triangles()[0]))
         sweeps = self._noting_truth(lidar.sweeps())
         start_ns = s.start_s * 1_000_000_000
         frames = {name: T for name, T in T_BASE.items() if name != "gnss" or s.gnss_lever_arm_known}
-        self._recorder.record(
-            stream, entries(start_ns, sweeps, imu_track(s, motion), wheel_track(s, motion), gnss, frames)
-        )
+        frames |= {optical(name): T for name, T in zip(NAMES, told_mounts(s))}
+        images = camera_entries(s, footage.shots()) if footage else iter(())
+        imu, wheel = imu_track(s, motion), wheel_track(s, motion)
+        self._recorder.record(stream, entries(start_ns, sweeps, imu, wheel, gnss, frames, images))
         self._motion, self._gnss, self._town_driven, self._movers = motion, gnss, town, movers
 
     def _town(self) -> Town:
@@ -108,6 +116,23 @@ class Drive:
         seen = [label.instance for label in self._true_labels()]
         true_tracks(self.settings, town.path, self._movers, town.instances, seen).write_to(stream)
 
+    def write_cameras(self, stream: IO[bytes]) -> None:
+        """Where the cameras truly are."""
+        stream.write(true_cameras(self.settings).model_dump_json(indent=1).encode() + b"\n")
+
+    def write_colours(self, stream: IO[bytes]) -> None:
+        """What colour every point has."""
+        self._driven()
+        TrueColours(self._true_colours()).write_to(stream)
+
+    def _true_colours(self) -> Iterator[TruePaint]:
+        for index, (albedo, lit) in enumerate(self._colours):
+            yield TruePaint(
+                np.frombuffer(zlib.decompress(albedo), np.uint8).reshape(-1, 3),
+                np.frombuffer(zlib.decompress(lit), np.bool_).astype(np.uint8),
+                scan_index=index,
+            )
+
     def _driven(self) -> Motion:
         """The motion, after the log was written."""
         if self._motion is None:
@@ -118,10 +143,12 @@ class Drive:
         return self._motion
 
     def _noting_truth(self, sweeps: Iterator[Sweep]) -> Iterator[Sweep]:
-        self._labels = []
+        self._labels, self._colours = [], []
         for sweep in sweeps:
             truth = (sweep.kind, sweep.instance, sweep.material)
             self._labels.append([zlib.compress(column.tobytes(), 1) for column in truth])
+            if sweep.albedo is not None and sweep.lit is not None:
+                self._colours.append([zlib.compress(c.tobytes(), 1) for c in (sweep.albedo, sweep.lit)])
             yield sweep
 
     def _true_labels(self) -> Iterator[TrueLabels]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import IO, Any
@@ -48,7 +48,8 @@ def _types() -> Any:
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
-def _class(name: str) -> Any:
+def class_of(name: str) -> Any:
+    """The class of a message type."""
     return _types().types[name]
 
 
@@ -56,6 +57,8 @@ def _class(name: str) -> Any:
 class Recorder:
     """Writes the log, and counts what it writes for `metadata.yaml`."""
 
+    types: dict[str, str] = field(default_factory=lambda: dict(TYPES))
+    """Type of each topic."""
     counts: dict[str, int] = field(default_factory=dict)
     first_ns: int = 0
     last_ns: int = 0
@@ -64,8 +67,8 @@ class Recorder:
         """Write all messages; same entries, same bytes."""
         writer = Writer(stream, compression=CompressionType.ZSTD, chunk_size=4 << 20)
         writer.start(profile="ros2", library="scanloom")
-        channels = {topic: self._channel(writer, topic) for topic in TYPES}
-        self.counts = dict.fromkeys(TYPES, 0)
+        channels = {topic: self._channel(writer, topic) for topic in self.types}
+        self.counts = dict.fromkeys(self.types, 0)
         for receive_ns, topic, header_ns, data in entries:
             writer.add_message(channels[topic], receive_ns, data, header_ns, self.counts[topic])
             self.first_ns = self.first_ns or receive_ns
@@ -74,8 +77,8 @@ class Recorder:
         writer.finish()
 
     def _channel(self, writer: Writer, topic: str) -> int:
-        text, _ = _types().generate_msgdef(TYPES[topic], ros_version=2)
-        schema = writer.register_schema(TYPES[topic], "ros2msg", text.encode())
+        text, _ = _types().generate_msgdef(self.types[topic], ros_version=2)
+        schema = writer.register_schema(self.types[topic], "ros2msg", text.encode())
         return int(writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": _qos(topic)}))
 
     def metadata(self) -> bytes:
@@ -92,7 +95,7 @@ class Recorder:
         ]
         for topic, count in self.counts.items():
             qos = json.dumps(_qos(topic))  # readers take only channels of the file with this very profile
-            kind = f"name: {topic}, type: {TYPES[topic]}, serialization_format: cdr"
+            kind = f"name: {topic}, type: {self.types[topic]}, serialization_format: cdr"
             meta = f"{{{kind}, offered_qos_profiles: {qos}}}"
             lines += [f"    - topic_metadata: {meta}", f"      message_count: {count}"]
         lines += [
@@ -127,9 +130,10 @@ def entries(
     wheel: WheelTrack,
     gnss: GnssTrack,
     frames: Mapping[str, F8],
+    images: Iterable[Entry] = (),
 ) -> Iterator[Entry]:
     """All messages in the order of their reception; `frames` are the poses of sensors that the log tells."""
-    streams = (_tf(start_ns, frames), _clouds(sweeps), _imu(imu), _wheel(wheel), _gnss(gnss))
+    streams = (_tf(start_ns, frames), _clouds(sweeps), _imu(imu), _wheel(wheel), _gnss(gnss), iter(images))
     return heapq.merge(*streams, key=lambda entry: entry[0])
 
 
@@ -143,12 +147,12 @@ def _cloud_message(sweep: Sweep) -> Any:
     points = np.zeros(len(sweep.xyz), POINT)
     points["x"], points["y"], points["z"] = sweep.xyz.T
     points["intensity"], points["ring"], points["time"] = sweep.intensity, sweep.ring, sweep.time_s
-    point_field = _class("sensor_msgs/msg/PointField")
+    point_field = class_of("sensor_msgs/msg/PointField")
     kinds = {"<f4": 7, "<u2": 4}
     layout = dict(POINT.fields or {})
     fields = [point_field(name, layout[name][1], kinds[layout[name][0].str], 1) for name in POINT.names or ()]
-    return _class(TYPES[LIDAR])(
-        header=_header(sweep.start_ns, "lidar"),
+    return class_of(TYPES[LIDAR])(
+        header=header(sweep.start_ns, "lidar"),
         height=1,
         width=len(points),
         fields=fields,
@@ -162,10 +166,10 @@ def _cloud_message(sweep: Sweep) -> Any:
 
 def _imu(track: ImuTrack) -> Iterator[Entry]:
     unknown = np.array([-1.0, *[0.0] * 8])
-    level = _class("geometry_msgs/msg/Quaternion")(0.0, 0.0, 0.0, 1.0)
+    level = class_of("geometry_msgs/msg/Quaternion")(0.0, 0.0, 0.0, 1.0)
     for stamp, gyro, accel in zip(track.stamp_ns.tolist(), track.gyro_rad_s, track.accel_m_s2):
-        message = _class(TYPES[IMU])(
-            _header(stamp, "imu"), level, unknown, _vector(gyro), np.zeros(9), _vector(accel), np.zeros(9)
+        message = class_of(TYPES[IMU])(
+            header(stamp, "imu"), level, unknown, _vector(gyro), np.zeros(9), _vector(accel), np.zeros(9)
         )
         yield stamp + DELAY_NS[IMU], IMU, stamp, _serialise(IMU, message)
 
@@ -175,43 +179,51 @@ def _wheel(track: WheelTrack) -> Iterator[Entry]:
     for stamp, speed, turn in zip(
         track.stamp_ns.tolist(), track.speed_m_s.tolist(), track.yaw_rate_rad_s.tolist()
     ):
-        twist = _class("geometry_msgs/msg/Twist")(_vector([speed, 0.0, 0.0]), _vector([0.0, 0.0, turn]))
-        with_covariance = _class("geometry_msgs/msg/TwistWithCovariance")(twist, covariance)
-        message = _class(TYPES[WHEEL])(_header(stamp, "base_link"), with_covariance)
+        twist = class_of("geometry_msgs/msg/Twist")(_vector([speed, 0.0, 0.0]), _vector([0.0, 0.0, turn]))
+        with_covariance = class_of("geometry_msgs/msg/TwistWithCovariance")(twist, covariance)
+        message = class_of(TYPES[WHEEL])(header(stamp, "base_link"), with_covariance)
         yield stamp + DELAY_NS[WHEEL], WHEEL, stamp, _serialise(WHEEL, message)
 
 
 def _gnss(track: GnssTrack) -> Iterator[Entry]:
     for k, stamp in enumerate(track.stamp_ns.tolist()):
-        status = _class("sensor_msgs/msg/NavSatStatus")(int(track.status[k]), 1)
+        status = class_of("sensor_msgs/msg/NavSatStatus")(int(track.status[k]), 1)
         latitude, longitude, height = track.geodetic[k].tolist()
         covariance = np.diag(track.variance_m2[k]).ravel()
-        message = _class(TYPES[GNSS])(
-            _header(stamp, "gnss"), status, latitude, longitude, height, covariance, 2
+        message = class_of(TYPES[GNSS])(
+            header(stamp, "gnss"), status, latitude, longitude, height, covariance, 2
         )
         yield stamp + DELAY_NS[GNSS], GNSS, stamp, _serialise(GNSS, message)
 
 
 def _tf(start_ns: int, frames: Mapping[str, F8]) -> Iterator[Entry]:
     transforms = [_transform(start_ns, child, T) for child, T in frames.items()]
-    yield start_ns, TF, start_ns, _serialise(TF, _class(TYPES[TF])(transforms))
+    yield start_ns, TF, start_ns, _serialise(TF, class_of(TYPES[TF])(transforms))
 
 
 def _transform(stamp_ns: int, child: str, T: F8) -> Any:
     qw, qx, qy, qz = quaternion_from_matrix(T[:3, :3]).tolist()
-    rotation = _class("geometry_msgs/msg/Quaternion")(qx, qy, qz, qw)
-    transform = _class("geometry_msgs/msg/Transform")(_vector(T[:3, 3]), rotation)
-    return _class("geometry_msgs/msg/TransformStamped")(_header(stamp_ns, "base_link"), child, transform)
+    rotation = class_of("geometry_msgs/msg/Quaternion")(qx, qy, qz, qw)
+    transform = class_of("geometry_msgs/msg/Transform")(_vector(T[:3, 3]), rotation)
+    return class_of("geometry_msgs/msg/TransformStamped")(header(stamp_ns, "base_link"), child, transform)
 
 
 def _vector(xyz: Any) -> Any:
-    return _class("geometry_msgs/msg/Vector3")(*(float(v) for v in xyz))
+    return class_of("geometry_msgs/msg/Vector3")(*(float(v) for v in xyz))
 
 
-def _header(stamp_ns: int, frame: str) -> Any:
+def header(stamp_ns: int, frame: str) -> Any:
+    """Header of a message."""
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-    return _class("std_msgs/msg/Header")(_class("builtin_interfaces/msg/Time")(seconds, nanoseconds), frame)
+    return class_of("std_msgs/msg/Header")(
+        class_of("builtin_interfaces/msg/Time")(seconds, nanoseconds), frame
+    )
 
 
 def _serialise(topic: str, message: Any) -> bytes:
-    return bytes(_types().serialize_cdr(message, TYPES[topic]))
+    return serialised(TYPES[topic], message)
+
+
+def serialised(kind: str, message: Any) -> bytes:
+    """A message of a type, as CDR."""
+    return bytes(_types().serialize_cdr(message, kind))

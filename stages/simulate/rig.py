@@ -14,15 +14,16 @@ WEAKEST = 1.2e-5
 """Received power, reflectivity over range squared, of which half the returns are lost."""
 
 
-def _mount(xyz: tuple[float, float, float], rpy_deg: tuple[float, float, float]) -> F8:
+def mount(xyz: tuple[float, float, float], rpy_deg: tuple[float, float, float]) -> F8:
+    """Pose (4, 4) at a place in metres, turned by roll, pitch and yaw in degrees."""
     roll, pitch, yaw = (np.radians([angle]) for angle in rpy_deg)
     return pose(rotations(roll, pitch, yaw)[0], xyz)
 
 
 T_BASE = {
-    "lidar": _mount((1.05, 0.03, 1.92), (0.7, 1.6, -1.1)),
-    "imu": _mount((0.35, -0.28, 0.55), (0.4, -0.6, 1.5)),
-    "gnss": _mount((-0.55, 0.35, 1.75), (0.0, 0.0, 0.0)),
+    "lidar": mount((1.05, 0.03, 1.92), (0.7, 1.6, -1.1)),
+    "imu": mount((0.35, -0.28, 0.55), (0.4, -0.6, 1.5)),
+    "gnss": mount((-0.55, 0.35, 1.75), (0.0, 0.0, 0.0)),
 }
 """Pose of each sensor in the base frame: on the ground below the rear axle, x forward."""
 

@@ -124,6 +124,57 @@ class Settings(BaseModel):
     wheel_clock_s: float = Field(0.015, ge=-0.1, le=0.1, description="delay of the wheel speed on its bus, s")
     stamp_jitter_s: float = Field(1e-4, ge=0.0, le=0.01, description="error of IMU and wheel stamps, s")
 
+    cameras: int = Field(
+        0, ge=0, le=3, description="cameras on board: front, left, right; 0 leaves the log without images"
+    )
+    camera_rate_hz: float = Field(2.0, ge=0.1, le=30.0, description="images of each camera per second, Hz")
+    camera_width_px: int = Field(640, ge=64, le=4096, description="width of an image, px")
+    camera_height_px: int = Field(400, ge=48, le=4096, description="height of an image, px")
+    lens: Literal["radial-tangential", "equidistant"] = Field(
+        "radial-tangential", description="kind of lens of all cameras"
+    )
+    exposure_noise: float = Field(
+        0.12,
+        ge=0.0,
+        le=1.0,
+        description="standard deviation of the exposure about what the image asks for, as a share of it",
+    )
+    readout_s: float = Field(
+        0.0,
+        ge=0.0,
+        le=0.1,
+        description="time from the first row of an image to the last, s; 0 is a global shutter",
+    )
+    camera_clock_s: float = Field(
+        0.0, ge=-1.0, le=1.0, description="how much later the cameras' stamps are than they should be, s"
+    )
+    camera_turned_deg: float = Field(
+        0.0,
+        ge=0.0,
+        le=30.0,
+        description="how far each camera was turned about some axis since the log's tf was true, deg",
+    )
+    camera_error_deg: float = Field(
+        0.03,
+        ge=0.0,
+        le=5.0,
+        description="error of the log's tf of a camera, each axis, standard deviation, deg",
+    )
+    camera_error_m: float = Field(
+        0.003, ge=0.0, le=0.5, description="the same of its place, each axis, standard deviation, m"
+    )
+    jpeg_quality: int = Field(90, ge=10, le=100, description="quality of the images as JPEG")
+    sun_elevation_deg: float = Field(42.0, ge=5.0, le=90.0, description="height of the sun, deg")
+    sun_azimuth_deg: float = Field(
+        205.0, ge=0.0, le=360.0, description="where the sun stands, clockwise from north, deg"
+    )
+    sun_share: float = Field(
+        0.5,
+        ge=0.0,
+        le=0.95,
+        description="share of the light on level ground that comes from the sun, the rest from the sky; 0 is overcast",
+    )
+
     gnss: bool = Field(True, description="a GNSS receiver is on board")
     gnss_multipath_m: float = Field(
         4.0, ge=0.0, le=50.0, description="size of the lie between high houses, m"

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,27 @@ class Sweep:
     kind: NDArray[np.uint8]
     instance: NDArray[np.uint16]
     material: NDArray[np.uint8]
+    albedo: NDArray[np.uint8] | None = None
+    """(n, 3) red, green, blue as sRGB, where there are cameras."""
+    lit: NDArray[np.bool_] | None = None
+    """(n,) whether the sun shines there."""
+
+
+class Colours(Protocol):
+    """What colour points have."""
+
+    def albedo(
+        self,
+        material: NDArray[np.uint8],
+        instance: NDArray[np.uint16],
+        own: NDArray[np.bool_],
+        points: F8,
+        times: F8,
+    ) -> NDArray[np.uint8]:
+        """sRGB (n, 3) of points (n, 3) of the world at times (n,) s; `own` are those of the own vehicle."""
+
+    def lit(self, points: F8, directions: F8) -> NDArray[np.bool_]:
+        """Whether the sun shines on points (n, 3) seen along directions (n, 3)."""
 
 
 @dataclass
@@ -64,7 +85,9 @@ class Lidar:
         motion: Motion,
         actors: Sequence[Mover],
         weather: Sequence[Air] = (),
+        colours: Colours | None = None,
     ) -> None:
+        self._colours = colours
         self._settings, self._town, self._motion, self._actors = settings, town, motion, actors
         self._weather = weather
         mesh, self._kind, self._instance = town.triangles()
@@ -122,7 +145,15 @@ class Lidar:
         for air in self._weather:
             t = float(times[len(times) // 2])
             _add_grains(echo, air.met(index, t, origin, direction, echo.range_m))
-        return self._report(index, start_s, times, echo, rng)
+        sweep, rows = self._report(index, start_s, times, echo, rng)
+        if self._colours is None:
+            return sweep
+        points = origin[rows] + direction[rows] * echo.range_m[rows, None]
+        column = times[self._column[rows]]
+        material, instance = echo.material[rows], echo.instance[rows]
+        own = echo.kind[rows] == PointClass.EGO
+        albedo = self._colours.albedo(material, instance, own, points, column)
+        return replace(sweep, albedo=albedo, lit=self._colours.lit(points, direction[rows]))
 
     def _town_echo(self, hit: dict[str, Any], origin: F8, direction: F8) -> _Echo:
         found = np.isfinite(hit["range"])
@@ -144,12 +175,9 @@ class Lidar:
         range_m: NDArray[Any],
     ) -> None:
         """What the ground is made of stands in a raster, finer than its triangles."""
-        raster = self._town.terrain.material
         rows = np.flatnonzero((kind == PointClass.GROUND) & (material == Material.GRASS))
         p = origin[rows, :2] + direction[rows, :2] * range_m[rows, None]
-        i = np.clip(((p[:, 1] - SOUTH) / RASTER_M).astype(int), 0, raster.shape[0] - 1)
-        j = np.clip(((p[:, 0] - WEST) / RASTER_M).astype(int), 0, raster.shape[1] - 1)
-        material[rows] = raster[i, j]
+        material[rows] = ground_material(self._town, p)
 
     def _see_own_vehicle(self) -> tuple[NDArray[np.int64], NDArray[Any], NDArray[Any], NDArray[Any]]:
         """Own roof and bonnet, the same in every sweep: rays, ranges, cosines, materials."""
@@ -201,8 +229,10 @@ class Lidar:
                 instance,
             )
 
-    def _report(self, index: int, start_s: float, times: F8, echo: _Echo, rng: np.random.Generator) -> Sweep:
-        """Noise, strength, losses: what is left of an echo when it leaves the sensor."""
+    def _report(
+        self, index: int, start_s: float, times: F8, echo: _Echo, rng: np.random.Generator
+    ) -> tuple[Sweep, NDArray[np.int64]]:
+        """Noise, strength, losses: what is left of an echo when it leaves the sensor, and the rays it is from."""
         s = self._settings
         n = len(echo.range_m)
         noise, chance, shade = rng.standard_normal(n), rng.random((3, n)), rng.standard_normal(n)
@@ -221,7 +251,7 @@ class Lidar:
         kind = np.where(stray, PointClass.OUTLIER, echo.kind).astype(np.uint8)
         intensity = np.clip(100 * strength * (1 + 0.08 * shade), 0, 255)
         time_s = times[self._column[rows]] - start_s
-        return Sweep(
+        sweep = Sweep(
             index=index,
             start_ns=s.start_s * 1_000_000_000 + round(start_s * 1e9),
             xyz=(self._rays[rows] * measured[rows, None]).astype(np.float32),
@@ -232,12 +262,21 @@ class Lidar:
             instance=echo.instance[rows],
             material=echo.material[rows],
         )
+        return sweep, rows
 
 
 def _rays(azimuth: F8, elevation: F8) -> F8:
     """Unit directions (columns * beams, 3), column by column; azimuths (columns,) or (columns, beams) rad."""
     a, e = np.broadcast_arrays(azimuth if azimuth.ndim == 2 else azimuth[:, None], elevation)
     return np.stack((np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)), axis=-1).reshape(-1, 3)
+
+
+def ground_material(town: Town, xy: F8) -> NDArray[np.uint8]:
+    """What the ground is made of at places (n, 2)."""
+    raster = town.terrain.material
+    i = np.clip(((xy[:, 1] - SOUTH) / RASTER_M).astype(int), 0, raster.shape[0] - 1)
+    j = np.clip(((xy[:, 0] - WEST) / RASTER_M).astype(int), 0, raster.shape[1] - 1)
+    return np.asarray(raster[i, j])
 
 
 def scene_of(mesh: Mesh) -> Any:

@@ -140,7 +140,7 @@ def _colour(rng: np.random.Generator) -> tuple[float, float, float]:
 def board_parts(board: Print, T_lidar_board: F8, rng: np.random.Generator) -> list[Part]:
     """The plate with its print, and what holds it: a tripod or a person behind it."""
     plate = board.outline_m()
-    print_ = quad(*plate, _LOOSE)
+    print_ = quad(plate[0], plate[1], plate[2], plate[3], _LOOSE)
     low, high = plate[0] - (0, 0, THICK_M), plate[2] - (0, 0, 1e-4)
     body = box(low, high, _LOOSE)
     return [
