@@ -20,15 +20,15 @@ from scanloom.schemas.scans import DeskewedScan, PointClass
 from scanloom.stages.clean import weights
 from scanloom.stages.clean.around import (
     AIR,
-    DIM,
     GROUND,
     NOTHING,
     OTHER,
     SOLID,
     WENT,
-    look_beside,
+    contrasts,
     over_ground,
     seen_ranges,
+    stands_out,
 )
 from scanloom.stages.clean.clusters import clusters
 from scanloom.stages.clean.incidence import I4
@@ -48,7 +48,7 @@ BRIGHT, SAMPLED, LEAST_BRIGHT = 0.8, 8, 50
 nothing."""
 ROUNDED = 0.01
 """When more than this share of what stands has the very lowest intensity, that tells nothing."""
-LEAST_ODDS = (-0.3, -0.3, -0.6)
+LEAST_ODDS = (0.8, 0.0, -0.9)
 """Log-odds of each round from which on a return is in the air."""
 STANDS = int(Standing.STANDS)
 HEARD_AGAIN = -6.0
@@ -132,13 +132,13 @@ def light_of(scan: DeskewedScan, said: U1) -> Light | None:
 def may_fly(
     scan: DeskewedScan, classes: U1, said: U1, taken: U1, cell: I4, away_m: F4, image: I4, light: Light | None
 ) -> tuple[I8, U1]:
-    """Returns (m,) that are asked about, by class and Standing (n,) and by what is around them; contrasts (n,)."""
+    """Returns (m,) that are asked about, by class and Standing (n,) and by what is around them; their contrasts (n,)."""
     lost = np.inf if light is None else light.lost
-    out, contrast = look_beside(away_m, scan.intensity, lost, classes, cell, image)
-    asked = by_standing(said, classes, ASKED).view(np.bool_) | out
-    asked |= (contrast > 0) & (contrast <= DIM)
-    asked |= over_ground(scan.x_m, scan.y_m, scan.z_m, away_m, classes, taken, cell, image)
-    return np.flatnonzero(asked), contrast
+    may = by_standing(said, classes, ASKED).view(np.bool_)
+    may |= stands_out(away_m, scan.intensity, lost, classes, cell, image)
+    may |= over_ground(scan.x_m, scan.y_m, scan.z_m, away_m, classes, taken, cell, image)
+    asked = np.flatnonzero(may)
+    return asked, contrasts(away_m, scan.intensity, lost, cell, image, asked)
 
 
 def airborne(scan: DeskewedScan, known: Known, apart_m: float) -> B1:

@@ -110,21 +110,40 @@ def over_ground(x: F4, y: F4, z: F4, away: F4, classes: U1, taken: U1, cell: I4,
 
 
 @kernel
-def look_beside(away: F4, intensity: F4, lost: float, classes: U1, cell: I4, image: I4) -> tuple[B1, U1]:
-    """Which returns (n,), `away` m from the sensor, stick out, and bins (n,) of their contrast to those beside them.
+def stands_out(away: F4, intensity: F4, lost: float, classes: U1, cell: I4, image: I4) -> B1:
+    """Which returns (n,), `away` m from the sensor, stick out, or are much fainter than both beside them.
 
-    Intensities up to `lost` tell nothing. The own vehicle and what is out of range never stick out and have no contrast.
+    Intensities up to `lost` tell nothing. The own vehicle and what is out of range never stand out.
     """
-    out, contrast = np.zeros(len(away), np.bool_), np.zeros(len(away), np.uint8)
+    out = np.zeros(len(away), np.bool_)
     for n in range(len(away)):
         if cell[n] < 0 or classes[n] == EGO or classes[n] == OUT_OF_RANGE:
             continue
         row, column = cell[n] >> COLUMN_BITS, cell[n] & LAST_COLUMN
-        left, right = _next(image, row, column, -1), _next(image, row, column, 1)
-        beyond, near = away[n] + OUT_M, NEAR_M + NEAR_PER_M * away[n]
-        out[n] = left >= 0 and right >= 0 and away[left] > beyond and away[right] > beyond
-        contrast[n] = _contrast(away, intensity, lost, n, left, right, near)
-    return out, contrast
+        left = _next(image, row, column, -1)
+        if left < 0:
+            continue
+        beyond = away[n] + OUT_M
+        faint = intensity[n] < CONTRAST_EDGES[DIM - 1] * float(intensity[left])
+        if not (faint or away[left] > beyond):
+            continue
+        right = _next(image, row, column, 1)
+        out[n] = right >= 0 and away[left] > beyond and away[right] > beyond
+        if faint and not out[n]:
+            out[n] = 0 < _contrast(away, intensity, lost, n, left, right) <= DIM
+    return out
+
+
+@kernel
+def contrasts(away: F4, intensity: F4, lost: float, cell: I4, image: I4, asked: I8) -> U1:
+    """Bins (n,) of the contrast of the returns `asked` (m,) to those beside them; 0 for the others."""
+    out = np.zeros(len(away), np.uint8)
+    for n in asked:
+        if cell[n] >= 0:
+            row, column = cell[n] >> COLUMN_BITS, cell[n] & LAST_COLUMN
+            left, right = _next(image, row, column, -1), _next(image, row, column, 1)
+            out[n] = _contrast(away, intensity, lost, n, left, right)
+    return out
 
 
 @kernel
@@ -138,11 +157,11 @@ def _next(image: I4, row: int, column: int, side: int) -> int:
 
 
 @kernel
-def _contrast(away: F4, intensity: F4, lost: float, n: int, left: int, right: int, near: float) -> int:
+def _contrast(away: F4, intensity: F4, lost: float, n: int, left: int, right: int) -> int:
     """Bin of the intensity of a return over that of the fainter of the near returns beside it; 0 when that tells nothing."""
     if not intensity[n] > lost:
         return 0
-    count, fainter = 0, np.inf
+    count, fainter, near = 0, np.inf, NEAR_M + NEAR_PER_M * away[n]
     for j in (left, right):
         if j >= 0 and abs(away[j] - away[n]) < near and intensity[j] > lost:
             count += 1

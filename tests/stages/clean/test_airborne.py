@@ -29,16 +29,18 @@ from scanloom.stages.clean.airborne import (
 )
 from scanloom.stages.clean.around import (
     AIR,
+    DIM,
     GROUND,
     NOTHING,
     OFF_LINE,
     OTHER,
     SOLID,
+    contrasts,
     look_around,
-    look_beside,
     off_line,
     over_ground,
     seen_ranges,
+    stands_out,
 )
 from scanloom.stages.clean.field import brick_key, brick_table
 from scanloom.stages.clean.lookup import standing, standing_around
@@ -229,8 +231,7 @@ def test_what_is_nearer_than_both_its_neighbours_sticks_out() -> None:
         cell, away_m = incidence.fill(x, y, np.zeros_like(x), image)
         for class_ in (PointClass.GROUND, PointClass.STATIC, PointClass.EGO, PointClass.OUT_OF_RANGE):
             classes, dark = np.full(11, class_, np.uint8), np.zeros(11, np.float32)
-            found, contrast = look_beside(away_m, dark, 0.0, classes, cell, image)
-            assert not contrast.any()
+            found = stands_out(away_m, dark, 0.0, classes, cell, image)
             counted = class_ in (PointClass.GROUND, PointClass.STATIC)
             assert found.tolist() == [is_out and counted and n == 5 for n in range(11)]
 
@@ -368,8 +369,10 @@ def test_contrast_is_told_against_the_fainter_of_what_is_near_beside(
     intensity = np.array([left, own, right], np.float32)
     for class_ in (PointClass.GROUND, PointClass.EGO):
         classes = np.full(3, class_, np.uint8)
-        contrast = look_beside(away_m, intensity, 2.0, classes, cell, image)[1]
-        assert contrast[1] == (found if class_ == PointClass.GROUND else 0)
+        out = stands_out(away_m, intensity, 2.0, classes, cell, image)
+        assert out[1] == (class_ == PointClass.GROUND and 0 < found <= DIM)
+    contrast = contrasts(away_m, intensity, 2.0, cell, image, np.array([1]))
+    assert contrast.tolist() == [0, found, 0]
 
 
 @pytest.mark.parametrize(
