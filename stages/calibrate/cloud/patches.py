@@ -20,6 +20,8 @@ _STRAYS = 2
 _HOLE = 1.5
 """Squares that may be missing in a run: dark ones may not answer."""
 _ROUNDS = 4
+_AGAIN = 0.6
+"""Share of rays that another piece had before: the same once more."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ def patches(sweep: Sweep, board: Board, settings: CloudSettings) -> Iterator[Pat
     """Pieces of planes that hang together and are not wider than the board's diagonal and a third of it."""
     diagonal = float(np.hypot(*board.board_m))
     points = sweep.points
+    taken = np.zeros(sweep.source.max() + 1, np.bool_)
     free = sweep.foreground & (sweep.range_m < settings.max_range_m)
     rng = np.random.default_rng(settings.seed)
     for seed in _seeds(sweep, points, free, min(board.board_m) / 2):
@@ -59,12 +62,14 @@ def patches(sweep: Sweep, board: Board, settings: CloudSettings) -> Iterator[Pat
             continue
         patch, reach = found
         mine = patch.rays
+        again = taken[sweep.source[mine]].mean() > _AGAIN
+        taken[sweep.source[mine]] = True
         near = np.linalg.norm(points[mine] - points[seed], axis=1) < (
             np.inf if reach < 1.3 * diagonal else diagonal / 2
         )
         _mark(sweep, free, mine[near])
         free[seed] = False
-        if reach < 1.3 * diagonal:
+        if reach < 1.3 * diagonal and not again:
             yield patch
 
 

@@ -25,6 +25,7 @@ from scanloom.stages.calibrate.cloud.sweep import B1, I8, Sweep
 from scanloom.stages.geometry.se3 import F8, se3_exp
 
 _ROUNDS = 4
+_STEPS_A_ROUND = 4
 _OUTLIER = 2.5
 """Standard deviations from which an error is trusted less (Cauchy)."""
 _FLARE_SIGMA_M = 0.008
@@ -40,6 +41,8 @@ _EDGE_SIGMA_M = 0.003
 """How unevenly an edge is hit, beyond the distance of two rays."""
 _ALIKE = 2.0
 """Neighbouring rays err alike where the blur is not quite as assumed: four of them count as one."""
+_FLUSH_M = 0.015
+"""By how much a ray may pass the outline, beyond the width of the beam, and still be the board's."""
 _FEWEST_ON_BEAM = 8
 """Points of a beam, at least, for its dark and bright to be told."""
 _LEAST_CONTRAST = 1e-9
@@ -114,40 +117,66 @@ def seen_of(sweep: Sweep, patch: Patch, edges: Edges, board: Board, settings: Cl
 
 def fitted(seen: Seen, T_start: F8, rounds: int = _ROUNDS) -> PoseFit:
     """The pose near a start, by robust least squares; scatter is taken from the residuals and weighed anew each round."""
-    from scipy.optimize import least_squares
-
-    T, sensor = T_start, np.zeros(len(SENSOR_SIGMA_M))
+    T, sensor, damping = T_start, np.zeros(len(SENSOR_SIGMA_M)), 1e-3
     for _ in range(rounds):
         scales = _scales(seen, T, sensor)
-        here = T
-
-        def residuals(x: F8, here: F8 = here, scales: _Scales = scales) -> F8:
-            return _residuals(seen, here @ se3_exp(x[_POSE]), x[_SENSOR], scales)
-
-        fit = least_squares(
-            residuals,
-            np.concatenate((np.zeros(6), sensor)),
-            loss="cauchy",
-            f_scale=_OUTLIER,
-            x_scale=_STEPS,
-            max_nfev=30,
-        )
-        T, sensor = here @ se3_exp(fit.x[_POSE]), fit.x[_SENSOR]
+        for _ in range(_STEPS_A_ROUND):
+            T, sensor, damping = _stepped(seen, T, sensor, scales, damping)
+    errors, slopes = _linear(seen, T, sensor, scales)
     gap, _ = _range_gaps(seen, T, sensor)
     return PoseFit(
         T_lidar_board=T,
-        covariance=np.linalg.inv(fit.jac.T @ fit.jac + np.diag(_UNKNOWN))[_POSE, _POSE],
+        covariance=_inverse(_information(errors, slopes) + np.diag(_UNKNOWN))[_POSE, _POSE]
+        + np.diag(_BENT**2),
         flare_m=float(sensor[0]),
         darker_m=float(sensor[1]),
         crossing_m=float(sensor[2]),
         farther_m=float(sensor[3]),
-        cost=float(fit.cost),
+        cost=_cost(errors),
         contrast=_contrast(seen, T, float(sensor[2])),
         rmse_m=float(np.sqrt(np.mean(gap**2))),
         beam_sigma_m=scales.beam_m,
         evidence=_evidence(seen, T, sensor, scales),
         seen=seen,
     )
+
+
+def _stepped(seen: Seen, T: F8, sensor: F8, scales: _Scales, damping: float) -> tuple[F8, F8, float]:
+    """One step of Levenberg and Marquardt with Cauchy's weights; the damping that is right for the next."""
+    errors, slopes = _linear(seen, T, sensor, scales)
+    weight = 1 / (1 + (errors / _OUTLIER) ** 2)
+    H, g = _information(errors, slopes), slopes.T @ (weight * errors)
+    before = _cost(errors)
+    for _ in range(4):
+        step = -np.linalg.solve(H + damping * np.diag(np.diag(H)) + 1e-9 * np.eye(len(H)), g)
+        ahead, shared = T @ se3_exp(step[_POSE]), sensor + step[_SENSOR]
+        if _cost(_residuals(seen, ahead, shared, scales)) <= before:
+            return ahead, shared, max(damping / 10, 1e-7)
+        damping *= 10
+    return T, sensor, damping
+
+
+def _linear(seen: Seen, T: F8, sensor: F8, scales: _Scales) -> tuple[F8, F8]:
+    """Errors (n,) and their derivatives (n, 10), by differences."""
+    errors = _residuals(seen, T, sensor, scales)
+    ahead = [
+        _residuals(seen, T @ se3_exp(step[_POSE]), sensor + step[_SENSOR], scales)
+        for step in _SLIGHT * np.eye(10)
+    ]
+    return errors, np.stack([(e - errors) / _SLIGHT for e in ahead], axis=1)
+
+
+def _information(errors: F8, slopes: F8) -> F8:
+    weight = 1 / (1 + (errors / _OUTLIER) ** 2)
+    return np.asarray(slopes.T @ (weight[:, None] * slopes), np.float64)
+
+
+def _inverse(matrix: F8) -> F8:
+    return np.asarray(np.linalg.inv(matrix), np.float64)
+
+
+def _cost(errors: F8) -> float:
+    return float(0.5 * _OUTLIER**2 * np.log1p((errors / _OUTLIER) ** 2).sum())
 
 
 def _evidence(seen: Seen, T: F8, sensor: F8, scales: _Scales) -> Evidence:
@@ -171,9 +200,10 @@ def _evidence(seen: Seen, T: F8, sensor: F8, scales: _Scales) -> Evidence:
 
 
 _SLIGHT = 1e-5
+_BENT = np.concatenate((np.full(3, 5e-4), np.full(3, 7e-4)))
+"""What no board is known better than, rad and m: print that is not quite in its place, a plate that is not quite flat."""
 _UNKNOWN = np.concatenate((np.full(3, 1.0), np.full(3, 4.0), np.zeros(4)))
 """Information of a board of which nothing is known: 1 rad and 0.5 m."""
-_STEPS = np.full(10, 0.01)
 
 
 @dataclass(frozen=True)
@@ -323,6 +353,31 @@ def with_squares(seen: Seen, first_dark: bool) -> Seen:
     return replace(seen, squares=True, first_dark=first_dark)
 
 
+def trimmed(seen: Seen, T: F8) -> Seen:
+    """Without the rays and edges that are clearly not the board's: hands and what else is flush with it."""
+    limit = seen.width_m + _FLUSH_M
+    on = outside(seen, T, seen.direction, 0.0) < limit
+    middle = seen.edges.on + seen.edges.off
+    near = np.abs(outside(seen, T, middle / np.linalg.norm(middle, axis=1)[:, None], 0.0)) < limit
+    near |= seen.edges.across
+    if on.all() and near.all():
+        return seen
+    names, beam = np.unique(seen.beam[on], return_inverse=True)
+    edges = seen.edges
+    return replace(
+        seen,
+        direction=seen.direction[on],
+        range_m=seen.range_m[on],
+        intensity=seen.intensity[on],
+        beam=beam.astype(np.int64),
+        beams=seen.beams[names],
+        inner=seen.inner[on],
+        edges=Edges(
+            edges.on[near], edges.off[near], edges.left[near], edges.across[near], edges.weight[near]
+        ),
+    )
+
+
 def agreement(seen: Seen, T: F8) -> float:
     """How well edges and squares agree with a pose: minus their cost, the scatter of the reflectance taken from itself."""
     sensor = np.zeros(len(SENSOR_SIGMA_M))
@@ -330,5 +385,4 @@ def agreement(seen: Seen, T: F8) -> float:
     edges = _other_errors(
         replace(seen, squares=False), T, sensor, _scales(replace(seen, squares=False), T, sensor)
     )
-    by_edges = 0.5 * _OUTLIER**2 * np.log1p((edges / _OUTLIER) ** 2).sum()
-    return float(-len(seen.beam) / (2 * _ALIKE**2) * np.log1p(-(contrast**2)) - by_edges)
+    return float(-len(seen.beam) / (2 * _ALIKE**2) * np.log1p(-(contrast**2)) - _cost(edges))

@@ -17,6 +17,7 @@ from scanloom.stages.calibrate.cloud.pose import (
     fitted,
     outside,
     seen_of,
+    trimmed,
     with_squares,
 )
 from scanloom.stages.calibrate.cloud.settings import CloudSettings
@@ -29,9 +30,10 @@ _LEAST_OVERLAP = 0.75
 """Rays that are on both piece and board, of those on either."""
 _ROUGH_OVERLAP = 0.6
 """The same before the fit."""
-_NEAR = 0.1
+_NEAR = 0.06
 """Distance of an edge from the board's outline that counts as near, as a share of its shorter side."""
-_NEAR_SHARE = 0.75
+_NEAR_SHARE = 0.6
+_FLUSH = (0.0, -0.5, 0.5)
 _SHIFTS = np.linspace(-1.25, 1.25, 11)
 """Squares by which starts are shifted where the edges leave the place open."""
 
@@ -67,6 +69,8 @@ def search_boards(
         if background is None
         else foreground_of(points, background, chosen.static_m)
     )
+    if not (np.isfinite(points).all(axis=1) & (np.abs(points) > chosen.min_range_m).any(axis=1)).any():
+        return Search((), ())
     sweep = sweep_of(
         np.asarray(points, np.float64), np.asarray(intensity), ring, foreground, chosen.min_range_m
     )
@@ -94,7 +98,7 @@ def _judged(sweep: Sweep, patch: Patch, board: Board, settings: CloudSettings) -
     ways = fits(rectangle, board, settings.extent_share)
     starts = [_start(patch, rectangle, board, turned) for turned, fit in enumerate(ways) if fit]
     if not starts:
-        clear = _without_hands(patch, edges, rectangle, seen, settings)
+        clear = _without_hands(sweep, patch, edges, rectangle, seen, settings)
         if clear is None:
             size, wanted = (_size(value) for value in (rectangle.size, board.board_m))
             return _refused(sweep, patch, f"measures {size}, the board {wanted}")
@@ -118,14 +122,17 @@ def _judged(sweep: Sweep, patch: Patch, board: Board, settings: CloudSettings) -
 
 
 def _without_hands(
-    patch: Patch, edges: Edges, rectangle: Rectangle, seen: Seen, settings: CloudSettings
+    sweep: Sweep, patch: Patch, edges: Edges, rectangle: Rectangle, seen: Seen, settings: CloudSettings
 ) -> tuple[Rectangle, F8] | None:
     """A measure by the edges near a board of the known size: hands and what else is flush with it spoil the others.
 
-    None where less than three quarters of the edges are near, or the measure still does not fit.
+    None where less than three fifths of the edges are near, or the measure still does not fit.
     """
-    rough = [fitted(seen, _start(patch, rectangle, seen.board, turned), rounds=2) for turned in (0, 1)]
-    T = min(rough, key=lambda fit: fit.cost).T_lidar_board
+    starts = [T for turned in (0, 1) for T in _flush(patch, rectangle, seen.board, turned)]
+    starts = [T for T in starts if _overlap(sweep, patch, seen, T) > _ROUGH_OVERLAP]
+    if not starts:
+        return None
+    T = fitted(seen, max(starts, key=lambda T: agreement(seen, T)), rounds=2).T_lidar_board
     middle = edges.on + edges.off
     middle = middle / np.linalg.norm(middle, axis=1)[:, None]
     near = np.abs(outside(seen, T, middle, 0.0)) < _NEAR * min(seen.board.board_m)
@@ -136,9 +143,20 @@ def _without_hands(
         patch,
         Edges(edges.on[near], edges.off[near], edges.left[near], edges.across[near], edges.weight[near]),
     )
-    if better is None or not any(fits(better, seen.board, settings.extent_share)):
+    if (
+        better is None
+        or not seen_sides(better, seen.board).all()
+        or not any(fits(better, seen.board, settings.extent_share))
+    ):
         return None
     return better, T
+
+
+def _flush(patch: Patch, rectangle: Rectangle, board: Board, turned: int) -> list[F8]:
+    """Boards in the middle of the rectangle, and flush with each of its sides."""
+    T = _start(patch, rectangle, board, turned)
+    x, y = (rectangle.size[::-1] if turned else rectangle.size) - board.board_m
+    return [T @ pose(np.eye(3), [i * x, j * y, 0.0]) for i in _FLUSH for j in _FLUSH]
 
 
 def _apart(sweep: Sweep, patch: Patch, overlap: float) -> Refused:
@@ -171,17 +189,19 @@ def _best(seen: Seen, starts: list[F8], settings: CloudSettings) -> PoseFit:
     """The best of the fits from all starts: by edges first, then with the squares where they can be seen."""
     rough = [fitted(seen, T, rounds=2) for T in starts]
     if settings.reflectance != "ignore" and np.ptp(seen.intensity) > 0:
-        options = [
-            (squares, T)
-            for squares in (with_squares(seen, True), with_squares(seen, False))
-            for fit in rough
-            for T in _shifted(squares, fit)
-        ]
-        squares, T = max(options, key=lambda option: agreement(*option))
-        fit = fitted(squares, T)
+        both = [_by_squares(with_squares(seen, dark), rough) for dark in (True, False)]
+        best = max(both, key=lambda fit: agreement(fit.seen, fit.T_lidar_board))
+        fit = fitted(trimmed(best.seen, best.T_lidar_board), best.T_lidar_board)
         if fit.contrast > _LEAST_CONTRAST:
             return fit
-    return fitted(seen, min(rough, key=lambda fit: fit.cost).T_lidar_board)
+    T = min(rough, key=lambda fit: fit.cost).T_lidar_board
+    return fitted(trimmed(seen, T), T)
+
+
+def _by_squares(seen: Seen, rough: list[PoseFit]) -> PoseFit:
+    """The fit from where edges and squares agree best."""
+    starts = [T for fit in rough for T in _shifted(seen, fit)]
+    return fitted(seen, max(starts, key=lambda T: agreement(seen, T)), rounds=2)
 
 
 def _shifted(seen: Seen, fit: PoseFit) -> list[F8]:
