@@ -2,9 +2,9 @@
 
 Denoise sees a few scans. Here it is known whether a place stands or was seen through before and after, which returns hang
 together, and whose box they lie in. Each kind of evidence (`signs`) adds the log-odds that it gives of a particle against
-anything else; then all is heard once more, the returns around and the rest of a thing being what the first round took them
-for. Of the ground, and of what denoise and the map agree on to stand, only that is asked which sticks out of its surroundings;
-of the ground, also that which has something in the air around it.
+anything else; then all is heard again, the returns around and the rest of a thing being what the round before took them for.
+Of the ground, and of what denoise and the map agree on to stand, only that is asked which sticks out or is much fainter than
+what is beside it; of the ground, also that which has something in the air around it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ nothing."""
 ROUNDED = 0.01
 """When more than this share of what stands has the very lowest intensity, that tells nothing."""
 LEAST_ODDS = (0.8, 0.0, -0.9)
-"""Log-odds of each round from which on a return is in the air."""
+"""Log-odds of each round from which on a return is in the air: at first only what is sure, so that no large thing beside the
+sensor talks itself into being a cloud."""
 STANDS = int(Standing.STANDS)
 HEARD_AGAIN = -6.0
 """Log-odds from which on a return is asked about in the next round."""

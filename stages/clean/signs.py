@@ -1,7 +1,8 @@
 """Signs of a particle: bins of what is known of a return, each of which adds its log-odds.
 
 What surrounds a return in its scan, the thing it hangs together with, the moving box around it and the weather of the scan
-are read off what the returns are taken for, round by round; strength, range and the map's word on its place stay.
+are read off what the returns are taken for, round by round; strength, contrast, range, how it lies to the lines between its
+neighbours, and the map's word on its place stay.
 """
 
 from __future__ import annotations
@@ -73,8 +74,8 @@ def signs(
 ) -> U1:  # fmt: skip
     """Bins (m, KINDS) of the returns asked about, all (n,) being what they are taken for.
 
-    away (n,): ranges, m; `ranges` those in the image (`seen_ranges`). near (n, 2): voxels around that stand, that went. loose (n,): what things are counted of.
-    strength, contrast (n,): bins.
+    away (n,): ranges, m; `ranges` those in the image (`seen_ranges`). near (n, 2): voxels around that stand, that went.
+    loose (n,): what things are counted of. strength, contrast (n,): bins.
     """
     members = np.flatnonzero(loose)
     size, air, went = _of_things(said, taken, thing, members)
