@@ -6,7 +6,7 @@ import json
 import logging
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -49,8 +49,8 @@ class Order:
     session: Path
     out: Path
     board: Path | None = None
-    calibrate: CalibrateSettings = field(default_factory=CalibrateSettings)
-    cloud: CloudSettings = field(default_factory=CloudSettings)
+    calibrate: CalibrateSettings = CalibrateSettings()
+    cloud: CloudSettings = CloudSettings()
     pictures: bool = True
 
 
@@ -280,7 +280,7 @@ def _no_board(session: CalibrationSession, searches: dict[str, Search]) -> Inval
 def _explained(error: InvalidInput, session: CalibrationSession, looked: Looked) -> InvalidInput:
     """The same error with the session's name and what could not be used."""
     lost = "; ".join(f"{name}: {reason}" for name, reason in looked.unseen.items())
-    what = f"{error.what}. Not usable: {lost}" if lost else error.what
+    what = f"{error.what}. Not usable: {lost}." if lost else f"{error.what}."
     where = (
         str(session.board_file)
         if error.where == "board.yaml"

@@ -124,7 +124,8 @@ def strangers(found: Sequence[Pair], start: Mapping[str, F8], limit: float) -> l
 
     In units of what the others scatter by (their median). A camera keeps three pairs at least.
     """
-    kept, out = list(found), []
+    kept = list(found)
+    out: list[Stranger] = []
     while True:
         judged = [s for i in range(len(kept)) if (s := _judged(kept, i, start)) is not None]
         if not judged:

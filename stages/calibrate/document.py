@@ -54,7 +54,12 @@ def document(
 
 def matrix(T: F8) -> Matrix4:
     """As documents hold a pose."""
-    return tuple(tuple(float(v) for v in row) for row in T)  # type: ignore[return-value]
+    a, b, c, d = ([float(v) for v in row] for row in T)
+    return _four(a), _four(b), _four(c), _four(d)
+
+
+def _four(v: list[float]) -> tuple[float, float, float, float]:
+    return v[0], v[1], v[2], v[3]
 
 
 def _certainty(found: Found, camera: str) -> Certainty:

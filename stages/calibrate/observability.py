@@ -43,7 +43,7 @@ def weakness(covariance: F8, camera: CameraModel, board: Board, found: Sequence[
 def _scaled(covariance: F8) -> F8:
     """Turns as shifts at `_REACH_M`."""
     scale = np.r_[np.full(3, _REACH_M), np.ones(3)]
-    return covariance * np.outer(scale, scale)
+    return np.asarray(covariance * np.outer(scale, scale))
 
 
 def _direction(covariance: F8) -> str:

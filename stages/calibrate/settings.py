@@ -13,60 +13,62 @@ class CalibrateSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     method: Literal["board", "paper"] = Field(
-        "board",
+        default="board",
         description="board: one pose per board, clouds as factors; paper: free corner points, images only",
     )
     start: Literal["epnp", "given"] = Field(
-        "epnp",
+        default="epnp",
         description="epnp: from the boards; given: the poses in the camera files, where these hold some",
     )
     corner_least_px: float = Field(
-        0.1, ge=0.01, le=5.0, description="corners are never believed better than this, one sigma, px"
+        default=0.1, ge=0.01, le=5.0, description="corners are never believed better than this, one sigma, px"
     )
     lidar: Literal["estimated", "believed"] = Field(
-        "estimated",
+        default="estimated",
         description="estimated: what all clouds of the sensor are off by is found along; believed: it is off in nothing",
     )
     beam_offset_m: float = Field(
-        0.01,
+        default=0.01,
         ge=0.0,
         le=0.1,
         description="by how much each beam's ranges may be off, one sigma, m; 0 believes them",
     )
     lens_share: float = Field(
-        0.0,
+        default=0.0,
         ge=0.0,
         le=0.05,
         description="how far focal lengths and centre may be from what was given, one sigma, as a share of the focal length; 0 keeps them",
     )
     scatter_px: float = Field(
-        1.0,
+        default=1.0,
         ge=0.1,
         le=20.0,
         description="images whose corners scatter more about a flat board are left out, px",
     )
     stranger: float = Field(
-        5.0,
+        default=5.0,
         ge=2.0,
         le=100.0,
         description="chi-square over its freedom from which a board is left out, number",
     )
     halves: int = Field(
-        10, ge=0, le=100, description="random halves of the placements for repeatability, number"
+        default=10, ge=0, le=100, description="random halves of the placements for repeatability, number"
     )
-    seed: int = Field(0, ge=0, le=2**31, description="seed of the halves")
-    good_px: float = Field(4.0, ge=0.1, le=50.0, description="leave-one-out error of a good calibration, px")
+    seed: int = Field(default=0, ge=0, le=2**31, description="seed of the halves")
+    good_px: float = Field(
+        default=4.0, ge=0.1, le=50.0, description="leave-one-out error of a good calibration, px"
+    )
     good_cm: float = Field(
-        1.0, ge=0.1, le=20.0, description="leave-one-out error on the board of a good calibration, cm"
+        default=1.0, ge=0.1, le=20.0, description="leave-one-out error on the board of a good calibration, cm"
     )
     good_deg: float = Field(
-        0.3,
+        default=0.3,
         ge=0.01,
         le=5.0,
         description="halves of a good calibration turn from their mean by less than this, degrees",
     )
     good_m: float = Field(
-        0.03,
+        default=0.03,
         ge=0.001,
         le=0.5,
         description="halves of a good calibration shift from their mean by less than this, m",

@@ -118,7 +118,8 @@ def rows_of(view: LidarView, sensor: Sensor, noise: Noise) -> Rows:
             [np.eye(nuisance), np.zeros((nuisance, view.root.shape[1] + 1))],
         ]
     )
-    left = np.linalg.qr(stacked, mode="r")[nuisance:, nuisance:]
+    triangle: F8 = np.asarray(np.linalg.qr(stacked, mode="r"))
+    left = triangle[nuisance:, nuisance:]
     by_sensor = np.zeros((len(left), len(sensor.mean)))
     by_sensor[:, sensor.columns(view)] = left[:, 6:-1]
     return Rows(view.T_lidar_board, left[:, :6], by_sensor, left[:, -1])
