@@ -41,6 +41,8 @@ _EDGE_SIGMA_M = 0.003
 """How unevenly an edge is hit, beyond the distance of two rays."""
 _ALIKE = 2.0
 """Neighbouring rays err alike where the blur is not quite as assumed: four of them count as one."""
+_FACING = 0.35
+"""Sine of the angle between a beam and a side from which it crosses it."""
 _FLUSH_M = 0.015
 """By how much a ray may pass the outline, beyond the width of the beam, and still be the board's."""
 _FEWEST_ON_BEAM = 8
@@ -230,11 +232,8 @@ def _scales(seen: Seen, T: F8, sensor: F8) -> _Scales:
     )
     prior = 4.0
     beam_sigma = np.sqrt(max(between + prior * seen.beam_sigma_m**2, 1e-8) / (max(used.sum() - 3, 0) + prior))
-    on, off = (outside(seen, T, d, sensor[2]) for d in (seen.edges.on, seen.edges.off))
-    spread = np.minimum(
-        np.abs(off - on), np.linalg.norm(_hits(T, seen.edges.on, 0.0) - _hits(T, seen.edges.off, 0.0), axis=1)
-    )
-    edge = np.sqrt(spread**2 / 12 + _EDGE_SIGMA_M**2) / np.sqrt(seen.edges.weight)
+    distance, _ = _crossed(seen, T, sensor[2])
+    edge = np.sqrt(distance[1] ** 2 / 12 + _EDGE_SIGMA_M**2) / np.sqrt(seen.edges.weight)
     return _Scales(sigma, float(beam_sigma), edge, _light_scales(seen, T, sensor))
 
 
@@ -271,11 +270,8 @@ def _residuals(seen: Seen, T: F8, sensor: F8, scales: _Scales) -> F8:
 
 
 def _other_errors(seen: Seen, T: F8, sensor: F8, scales: _Scales) -> F8:
-    middle = seen.edges.on + seen.edges.off
-    middle = middle / np.linalg.norm(middle, axis=1)[:, None]
-    edges = (
-        outside(seen, T, middle, sensor[2]) - np.where(seen.edges.across, 0.0, sensor[0])
-    ) / scales.edge_m
+    distance, _ = _crossed(seen, T, sensor[2])
+    edges = (distance[0] - np.where(seen.edges.across, 0.0, sensor[0])) / scales.edge_m
     if not seen.squares:
         return edges
     light, _ = _light_gaps(seen, T, sensor[2])
@@ -288,6 +284,27 @@ def _reach(T: F8, directions: F8, crossing_m: float) -> tuple[F8, F8]:
     slope = np.minimum(directions @ n, -1e-3)
     low = crossing_m * directions[:, 2] / np.hypot(directions[:, 0], directions[:, 1])
     return (n @ T[:3, 3] + low * n[2]) / slope, low
+
+
+def _crossed(seen: Seen, T: F8, crossing_m: float) -> tuple[tuple[F8, F8], I8]:
+    """Of each pair of rays with an edge between: distances (e,), m, and the side of the outline that they cross.
+
+    The first distance is that of the middle from the side, positive outside, the second is how far apart the rays are
+    across it. Only sides that face the way from the one to the other count: a beam that runs along a side tells nothing
+    of it.
+    """
+    edges = seen.edges
+    on, off = (_hits(T, d, crossing_m) for d in (edges.on, edges.off))
+    way = off - on
+    length = np.maximum(np.hypot(way[:, 0], way[:, 1]), 1e-9)
+    middle = (on + off) / 2 - np.asarray(seen.board.offset_m)
+    depth = np.sign(way) * middle - np.asarray(seen.board.board_m) / 2
+    facing = np.abs(way) > _FACING * length[:, None]
+    axis = np.argmax(np.where(facing, depth, -np.inf), axis=1)
+    row = np.arange(len(axis))
+    positive = way[row, axis] > 0
+    side = np.where(axis == 0, np.where(positive, 1, 3), np.where(positive, 2, 0))
+    return (depth[row, axis], np.abs(way[row, axis])), side
 
 
 def _hits(T: F8, directions: F8, crossing_m: float) -> F8:
