@@ -98,7 +98,9 @@ def read_board(path: Path) -> Board:
             data = file.read(_MOST_BYTES + 1)
     except OSError as error:
         raise InvalidInput(
-            "the board cannot be read: " + (error.strerror or str(error)), where=str(path)
+            "the board cannot be read: " + (error.strerror or str(error)),
+            where=str(path),
+            next_step=f"write it as in: {_EXAMPLE}",
         ) from error
     return parse_board(data, str(path))
 
