@@ -43,13 +43,17 @@ class Daylight:
         shadow."""
         return self._open(points, self.towards_sun)
 
-    def falling(self, points: F8, normals: F8) -> tuple[F4, B1]:
-        """Light (n, 3), red green blue, on surfaces at points (n, 3) of the world, and where the sun shines."""
+    def under_sky(self, points: F8, normals: F8) -> B1:
+        """Whether nothing is above points (n, 3) of the world."""
+        return self._open(points + _LIFT_M * normals, np.array([0.0, 0.0, 1.0]))
+
+    def falling(self, points: F8, normals: F8, open_up: B1) -> tuple[F4, B1]:
+        """Light (n, 3), red green blue, on surfaces at points (n, 3) of the world, of which some have nothing above
+        them, and where the sun shines."""
         before = points + _LIFT_M * normals
         facing = normals @ self.towards_sun
         lit = facing > 0.0
         lit[lit] = self._open(before[lit], self.towards_sun)
-        open_up = self._open(before, np.array([0.0, 0.0, 1.0]))
         sky = self._sky * np.where(open_up, 1.0, _UNDER_ROOF)
         level = (0.5 + 0.5 * normals[:, 2]).astype(np.float32)
         from_sky = (sky * level + _BOUNCED * (1.0 - level) * np.where(open_up, 1.0, _UNDER_ROOF)).astype(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -97,19 +97,24 @@ _KNOT_PX = 8
 """Between knots of the spline: it is within 1e-5 px there."""
 
 
-def picture(eye: Eye, look: Look, samples: int, contrast: float) -> F4:
-    """Radiance (h, w, 3): one ray a pixel, and `samples` squared where neighbours show other things, or differ in
-    brightness by more than `contrast` of their own."""
+def squares(samples: int) -> tuple[tuple[float, float], ...]:
+    """Places right of and below a pixel's centre: a grid of `samples` squared."""
+    places = ((np.arange(samples) + 0.5) / samples - 0.5).tolist()
+    return tuple((right, down) for down in places for right in places)
+
+
+def picture(eye: Eye, look: Look, places: Sequence[tuple[float, float]], contrast: float) -> F4:
+    """Radiance (h, w, 3): one ray a pixel; the mean over `places` where neighbours show other things, or differ in
+    brightness by more than `contrast` of their own. A place at the centre costs nothing."""
     shape = eye.height, eye.width
     radiance, what = look(eye.directions(eye.pixels), eye.pixels)
     rows = np.flatnonzero(_uneven(radiance.sum(axis=1).reshape(shape), what.reshape(shape), contrast))
-    if len(rows) and samples > 1:
-        places = (np.arange(samples) + 0.5) / samples - 0.5
+    if len(rows):
         total = np.zeros((len(rows), 3), np.float32)
-        for down in places.tolist():
-            for right in places.tolist():
-                total += look(eye.directions(rows, right, down), rows)[0]
-        radiance[rows] = total / np.float32(samples**2)
+        for right, down in places:
+            centre = right == 0.0 and down == 0.0
+            total += radiance[rows] if centre else look(eye.directions(rows, right, down), rows)[0]
+        radiance[rows] = total / np.float32(len(places))
     return radiance.reshape(*shape, 3)
 
 

@@ -23,7 +23,7 @@ from scanloom.stages.simulate.sweeping import ground_material, scene_of
 from scanloom.stages.simulate.town import Town
 from scanloom.stages.simulate.traffic import Mover
 
-_SAMPLES, _CONTRAST = 2, 0.35
+_PLACES, _CONTRAST = ((0.0, 0.0), (0.3, -0.2), (-0.3, 0.2)), 0.6
 _GREY = 0.2
 """Brightness that the exposure brings the image's mean to."""
 _SLOW = 0.45
@@ -84,11 +84,15 @@ class Footage:
         self._material = mesh.material
         self._scene = scene_of(mesh)
         self._bodies = [scene_of(mover.mesh) for mover in movers]
+        self._reach_m = [float(np.linalg.norm(m.mesh.vertices, axis=1).max()) + 0.5 for m in movers]
         self._own, self._own_material = scene_of(vehicle()), vehicle().material
         self._light = Daylight(settings, self._scene)
         self._paints = paints
         self._mounts = true_mounts(settings)
         self._eyes = [Eye(model(settings, k)) for k in range(settings.cameras)]
+        self._half_view = [
+            float(np.arccos(np.clip(eye.directions(eye.pixels)[:, 2].min(), -1, 1))) for eye in self._eyes
+        ]
         self._sees_own = [self._own_pixels(eye, T) for eye, T in zip(self._eyes, self._mounts)]
 
     def albedo(
@@ -128,14 +132,33 @@ class Footage:
         rows = np.arange(eye.height) if s.readout_s > 0 else np.zeros(1, int)
         times = t + s.readout_s * (rows / max(eye.height - 1, 1) - 0.5) * (s.readout_s > 0)
         T_world_base = self._motion.poses(times)
-        movers = [number for number, mover in enumerate(self._movers) if mover.present(np.array([t]))[0]]
+        movers = self._in_view(camera, T_world_base[len(times) // 2] @ mounted, t)
+        under_sky = np.zeros(eye.height * eye.width, bool)
 
         def look(directions: F8, pixels: I8) -> tuple[F4, I8]:
             row = pixels // eye.width if s.readout_s > 0 else np.zeros(len(pixels), int)
             seen, d = self._look(camera, directions, pixels, T_world_base, times, row, movers, mounted)
-            return self._shaded(seen, d, directions), seen.material + 64 * seen.tint
+            if len(pixels) == len(under_sky):  # of finer looks it is taken from this first one
+                at = np.flatnonzero(seen.found)
+                under_sky[at] = self._light.under_sky(seen.points[at], seen.normal[at])
+            return self._shaded(seen, d, directions, under_sky[pixels]), seen.material + 64 * seen.tint
 
-        return picture(eye, look, _SAMPLES, _CONTRAST)
+        return picture(eye, look, _PLACES, _CONTRAST)
+
+    def _in_view(self, camera: int, T_world_camera: F8, t: float) -> list[int]:
+        """Numbers of movers that may be in the image."""
+        forward, numbers = T_world_camera[:3, 2], []
+        for number, mover in enumerate(self._movers):
+            if not mover.present(np.array([t]))[0]:
+                continue
+            to_mover = mover.poses(self._town.path, np.array([t]))[0, :3, 3] - T_world_camera[:3, 3]
+            away, reach = float(np.linalg.norm(to_mover)), self._reach_m[number]
+            if away > _FAR_M:
+                continue
+            aside = np.arccos(np.clip(forward @ to_mover / max(away, 1e-3), -1.0, 1.0))
+            if away < 2 * reach or aside < self._half_view[camera] + np.arcsin(reach / away):
+                numbers.append(number)
+        return numbers
 
     def _look(
         self, camera: int, directions: F8, pixels: I8, T_world_base: F8, times: F8, row: I8, movers: Sequence[int], mounted: F8
@@ -168,9 +191,7 @@ class Footage:
         mover = self._movers[number]
         poses = mover.poses(self._town.path, times)
         to_mover = poses[len(poses) // 2, :3, 3] - origin[len(origin) // 2]
-        reach = float(np.linalg.norm(mover.mesh.vertices, axis=1).max()) + 0.5
-        if np.linalg.norm(to_mover) > _FAR_M:
-            return
+        reach = self._reach_m[number]
         along = d @ to_mover
         near = np.flatnonzero((along > -reach) & (to_mover @ to_mover - along**2 < reach**2))
         if len(near) == 0:
@@ -206,12 +227,12 @@ class Footage:
         _put(seen, rows, hit.range_m[ahead], origin, d, normal, material, fixed)
         seen.tint[rows] = _OWN
 
-    def _shaded(self, seen: _Seen, d: F8, directions: F8) -> F4:
+    def _shaded(self, seen: _Seen, d: F8, directions: F8, under_sky: B1) -> F4:
         """Paint in its light, mirrors of glass and paint, haze, and the sky where nothing is."""
         radiance = np.zeros((len(d), 3), np.float32)
         at = np.flatnonzero(seen.found)
         albedo = self._paints.albedo(seen.material[at], seen.tint[at], seen.fixed[at])
-        light, lit = self._light.falling(seen.points[at], seen.normal[at])
+        light, lit = self._light.falling(seen.points[at], seen.normal[at], under_sky[at])
         colour = albedo * light
         for kind, gloss in _GLOSSY.items():
             shiny = np.flatnonzero(seen.material[at] == kind)

@@ -11,9 +11,9 @@ from scanloom.stages.geometry.se3 import F8, inverse, transform
 from scanloom.stages.simulate.boards.print import Print
 from scanloom.stages.simulate.boards.room import Look, Scenery
 from scanloom.stages.simulate.exposure import Film, develop
-from scanloom.stages.simulate.eye import F4, I8, Eye, meet, picture
+from scanloom.stages.simulate.eye import F4, I8, Eye, meet, picture, squares
 
-_SAMPLES, _CONTRAST = 4, 0.08
+_PLACES, _CONTRAST = squares(4), 0.08
 _AMBIENT = 0.35
 _GREY = 0.24
 """Brightness that the exposure brings the image's mean to."""
@@ -43,7 +43,7 @@ def shot(
         colour[~hit.found | ~directions.any(axis=1)] = 0.0
         return colour.astype(np.float32), hit.triangle
 
-    radiance = picture(eye, look, _SAMPLES, _CONTRAST)
+    radiance = picture(eye, look, _PLACES, _CONTRAST)
     brightness = np.minimum(radiance.mean(axis=2), 1.0)
     exposure = _GREY / max(float(brightness.mean()), 1e-3) * float(np.exp(0.15 * rng.standard_normal()))
     return develop(radiance, exposure, eye.model, Film(blur_px=blur_px), rng)
