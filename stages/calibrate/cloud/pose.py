@@ -371,13 +371,16 @@ def with_squares(seen: Seen, first_dark: bool) -> Seen:
 
 
 def trimmed(seen: Seen, T: F8) -> Seen:
-    """Without the rays and edges that are clearly not the board's: hands and what else is flush with it."""
+    """Without the rays and edges that are clearly not the board's: hands and what else is flush with it.
+
+    All of it where little would be left: then this is no board.
+    """
     limit = seen.width_m + _FLUSH_M
     on = outside(seen, T, seen.direction, 0.0) < limit
     middle = seen.edges.on + seen.edges.off
     near = np.abs(outside(seen, T, middle / np.linalg.norm(middle, axis=1)[:, None], 0.0)) < limit
     near |= seen.edges.across
-    if on.all() and near.all():
+    if (on.all() and near.all()) or on.mean() < 0.5 or (near & ~seen.edges.across).sum() < 4:
         return seen
     names, beam = np.unique(seen.beam[on], return_inverse=True)
     edges = seen.edges

@@ -26,6 +26,8 @@ from scanloom.stages.geometry.se3 import F8, hat, pose, transform
 
 _LEAST_CONTRAST = 0.35
 """Correlation of the reflectance with the print from which squares count as seen."""
+_CLEAR_CONTRAST = 0.6
+"""The same where they stand for a side that cannot be measured."""
 _LEAST_OVERLAP = 0.75
 """Rays that are on both piece and board, of those on either."""
 _ROUGH_OVERLAP = 0.6
@@ -111,13 +113,12 @@ def _judged(sweep: Sweep, patch: Patch, board: Board, settings: CloudSettings) -
     overlap = _overlap(sweep, patch, seen, fit.T_lidar_board)
     if overlap < _LEAST_OVERLAP:
         return _apart(sweep, patch, overlap)
-    if not fit.seen.squares:
-        if settings.reflectance == "require":
-            return _refused(sweep, patch, "no squares in its reflectance")
-        if not seen_sides(rectangle, board).all():
-            return _refused(
-                sweep, patch, "no squares in its reflectance, and only one of its sides can be measured"
-            )
+    if settings.reflectance == "require" and not fit.seen.squares:
+        return _refused(sweep, patch, "no squares in its reflectance")
+    if not seen_sides(rectangle, board).all() and not (fit.seen.squares and fit.contrast > _CLEAR_CONTRAST):
+        return _refused(
+            sweep, patch, "no clear squares in its reflectance, and only one of its sides can be measured"
+        )
     return _cloud_board(sweep, patch, rectangle, fit, overlap)
 
 
@@ -143,11 +144,7 @@ def _without_hands(
         patch,
         Edges(edges.on[near], edges.off[near], edges.left[near], edges.across[near], edges.weight[near]),
     )
-    if (
-        better is None
-        or not seen_sides(better, seen.board).all()
-        or not any(fits(better, seen.board, settings.extent_share))
-    ):
+    if better is None or not any(fits(better, seen.board, settings.extent_share)):
         return None
     return better, T
 

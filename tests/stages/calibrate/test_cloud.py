@@ -37,7 +37,7 @@ def sigmas(found: CloudBoard, T: F8) -> F8:
     return np.abs(error(found, T)) / np.sqrt(np.diag(found.covariance))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("T", [DIAMOND, UPRIGHT], ids=["diamond", "upright"])
 def test_a_held_board_is_found_where_it_is(T: F8, seed: int) -> None:
     result = searched([board_panel(T)], seed=seed)
@@ -54,7 +54,7 @@ def test_a_held_board_is_found_where_it_is(T: F8, seed: int) -> None:
 
 def test_errors_are_as_large_as_the_covariance_says() -> None:
     z = np.concatenate(
-        [sigmas(searched([board_panel(DIAMOND)], seed=s).boards[0], DIAMOND) for s in range(5)]
+        [sigmas(searched([board_panel(DIAMOND)], seed=s).boards[0], DIAMOND) for s in range(4)]
     )
     assert 0.4 < np.sqrt(np.mean(z**2)) < 1.5
 
@@ -112,13 +112,13 @@ def test_reflectance_of_another_scale_gives_the_same() -> None:
 
 
 def test_an_upright_board_without_squares_is_uncertain_along_its_upright_sides() -> None:
-    found = searched([board_panel(UPRIGHT)], reflectance="ignore").boards
-    best = min(found, key=lambda b: np.linalg.norm(b.T_lidar_board[:3, 3] - UPRIGHT[:3, 3]))
+    T = facing(2.3, 20.0, -0.05, 90.0, (8.0, 0.0))
+    best = searched([board_panel(T)], reflectance="ignore").boards[0]
     upright = np.argmax(np.abs(best.T_lidar_board[2, :2]))
     sigma = np.sqrt(np.diag(best.covariance)[3:5])
-    assert sigma[upright] > 5 * sigma[1 - upright]
-    assert sigma[upright] > 0.01
-    assert sigmas(best, UPRIGHT).max() < 3.5
+    assert sigma[upright] > 4 * sigma[1 - upright]
+    assert 0.01 < sigma[upright] < 0.1
+    assert sigmas(best, T).max() < 3.5
 
 
 def test_beams_are_told_apart_without_rings() -> None:
@@ -159,7 +159,7 @@ def test_two_boards_in_view() -> None:
 
 
 def test_no_board_is_no_board() -> None:
-    result = searched([])
+    result = searched([], Lidar(sight_deg=(20.0, 75.0)))
     assert not result.boards
     assert result.refused and all(piece.reason for piece in result.refused)
 
