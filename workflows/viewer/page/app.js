@@ -10,7 +10,7 @@ import { View } from "./scene.js";
 
 const DATA = "/data/";
 const PATIENCE = 5; // while points arrive a fifth of the time is spent on drawing them
-const LONGEST_MS = 2000;
+const LONGEST_MS = 5000;
 const narrow = () => matchMedia("(max-width: 640px)").matches;
 
 class App {
@@ -136,9 +136,9 @@ class App {
   // What the user does is seen at once. What arrives is seen a few times a second, and where drawing is slow less often, so
   // that it leaves most of the time to reading.
   due(now) {
-    const cost = this.view.drawingTook();
-    const rest = cost === null ? Infinity : Math.max(120, PATIENCE * cost);
-    const waited = this.cloud.busy || this.removed?.busy ? now - this.drawn > Math.min(rest, LONGEST_MS) : cost !== null;
+    const cost = this.view.drawingTook(); // null while the last picture is being drawn
+    const rest = this.cloud.busy || this.removed?.busy ? Math.min(Math.max(120, PATIENCE * cost), cost + LONGEST_MS) : 0;
+    const waited = cost !== null && now - this.drawn > rest;
     if (!this.dirty && !(this.stale && waited)) return false;
     this.dirty = this.stale = false;
     this.drawn = now;
