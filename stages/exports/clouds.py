@@ -15,7 +15,7 @@ from scanloom.schemas.errors import InvalidInput
 from scanloom.schemas.tiles import RemovedTile, Tile
 from scanloom.stages.exports.coordinates import Projector
 from scanloom.stages.exports.options import Options
-from scanloom.stages.exports.source import MapSource
+from scanloom.stages.exports.source import MapSource, opened
 
 F8 = NDArray[np.float64]
 
@@ -129,7 +129,7 @@ def box_of(source: MapSource, projector: Projector, options: Options) -> F8:
 def part(source: MapSource, name: str) -> Tile:
     """One of `part_names`; sessions are numbered as in `session_names`, not as in the tile."""
     kind = RemovedTile if name.endswith(REMOVED) else Tile
-    tile = kind.open(part_file(source, name))
+    tile = opened(kind, part_file(source, name))
     everyone = session_names(source)
     numbers = np.array([everyone.index(session) for session in tile.sessions] or [0], np.uint16)
     return replace(tile, session=numbers[tile.session], sessions=everyone)

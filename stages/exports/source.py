@@ -6,14 +6,35 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from scanloom.schemas.errors import InvalidInput
+from scanloom.schemas.errors import InvalidInput, ProductError
 from scanloom.schemas.frames import Georeference
+from scanloom.schemas.product import Table
 from scanloom.schemas.tiles import Tile, TileIndex
 from scanloom.schemas.trajectory import Poses
 
 HEADER, INDEX = "map.json", "tiles/index.parquet"
+
+
+T = TypeVar("T", bound=Table)
+
+
+def opened(kind: type[T], path: Path) -> T:
+    """A table of a delivered map.
+
+    Raises
+    ------
+    InvalidInput : it is missing or damaged, so that the map is not whole.
+    """
+    try:
+        return kind.open(path)
+    except ProductError as error:
+        raise InvalidInput(
+            f"is part of the map and {error.what}",
+            where=str(path),
+            next_step="make the map whole by the `scanloom map` command that made it: what the store holds is not computed again",
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -36,13 +57,16 @@ class MapSource:
         """
         try:
             header = json.loads((folder / HEADER).read_text())
+            if not isinstance(header, dict) or "name" not in header:
+                raise ValueError("it describes no map")
         except (OSError, ValueError) as error:
+            why = error.strerror if isinstance(error, OSError) else str(error)
             raise InvalidInput(
-                f"holds no map: {HEADER} cannot be read ({error})",
+                f"holds no map: {HEADER} cannot be read ({why})",
                 where=str(folder),
                 next_step="give the folder that `scanloom map` wrote, for instance maps/sample",
             ) from error
-        return cls(folder, header, TileIndex.open(folder / INDEX))
+        return cls(folder, header, opened(TileIndex, folder / INDEX))
 
     @property
     def name(self) -> str:
@@ -61,7 +85,7 @@ class MapSource:
 
     def tile(self, name: str) -> Tile:
         """Points of one tile."""
-        return Tile.open(self.folder / "tiles" / f"{name}.parquet")
+        return opened(Tile, self.folder / "tiles" / f"{name}.parquet")
 
     def tiles(self) -> Iterator[tuple[str, Tile]]:
         """Tile after tile, by name."""

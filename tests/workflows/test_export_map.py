@@ -177,6 +177,29 @@ def test_a_missing_library_names_its_extra(folder: Path, monkeypatch: pytest.Mon
     assert "scanloom[las]" in caught.value.next_step
 
 
+def no_index(folder: Path) -> None:
+    (folder / "tiles/index.parquet").unlink()
+
+
+def no_name(folder: Path) -> None:
+    (folder / "map.json").write_text("[]")
+
+
+def cut_index(folder: Path) -> None:
+    path = folder / "tiles/index.parquet"
+    path.write_bytes(path.read_bytes()[:-9])
+
+
+@pytest.mark.parametrize(
+    ("harm", "named"), [(no_index, "index.parquet"), (cut_index, "index.parquet"), (no_name, "map.json")]
+)
+def test_half_a_map(folder: Path, harm, named: str) -> None:
+    harm(folder)
+    with pytest.raises(InvalidInput, match=named) as caught:
+        export_map(folder, "pcd", Options())
+    assert "scanloom map" in caught.value.next_step and "Errno" not in str(caught.value)[:60]
+
+
 def test_not_a_map(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match="holds no map"):
         export_map(tmp_path, "pcd", Options())
