@@ -398,6 +398,11 @@ def trimmed(seen: Seen, T: F8) -> Seen:
     )
 
 
+def contrast_of(seen: Seen, T: F8) -> float:
+    """Correlation of the reflectance with the print at a pose, beam by beam."""
+    return _contrast(seen, T, 0.0)
+
+
 def agreement(seen: Seen, T: F8) -> float:
     """How well edges and squares agree with a pose: minus their cost, the scatter of the reflectance taken from itself."""
     sensor = np.zeros(len(SENSOR_SIGMA_M))

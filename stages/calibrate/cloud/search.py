@@ -14,6 +14,7 @@ from scanloom.stages.calibrate.cloud.pose import (
     PoseFit,
     Seen,
     agreement,
+    contrast_of,
     fitted,
     outside,
     seen_of,
@@ -26,6 +27,9 @@ from scanloom.stages.geometry.se3 import F8, hat, pose, transform
 
 _LEAST_CONTRAST = 0.35
 """Correlation of the reflectance with the print from which squares count as seen."""
+_FAINT_CONTRAST = 0.2
+"""The same before the fit."""
+_CLEARLY_LESS = 0.3
 _CLEAR_CONTRAST = 0.6
 """The same where they stand for a side that cannot be measured."""
 _LEAST_OVERLAP = 0.75
@@ -186,19 +190,28 @@ def _best(seen: Seen, starts: list[F8], settings: CloudSettings) -> PoseFit:
     """The best of the fits from all starts: by edges first, then with the squares where they can be seen."""
     rough = [fitted(seen, T, rounds=2) for T in starts]
     if settings.reflectance != "ignore" and np.ptp(seen.intensity) > 0:
-        both = [_by_squares(with_squares(seen, dark), rough) for dark in (True, False)]
-        best = max(both, key=lambda fit: agreement(fit.seen, fit.T_lidar_board))
-        fit = fitted(trimmed(best.seen, best.T_lidar_board), best.T_lidar_board)
-        if fit.contrast > _LEAST_CONTRAST:
+        fit = _by_squares(seen, rough)
+        if fit is not None and fit.contrast > _LEAST_CONTRAST:
             return fit
     T = min(rough, key=lambda fit: fit.cost).T_lidar_board
     return fitted(trimmed(seen, T), T)
 
 
-def _by_squares(seen: Seen, rough: list[PoseFit]) -> PoseFit:
-    """The fit from where edges and squares agree best."""
+def _by_squares(seen: Seen, rough: list[PoseFit]) -> PoseFit | None:
+    """The fit from where edges and squares agree best; None where nowhere near any squares are to be seen."""
     starts = [T for fit in rough for T in _shifted(seen, fit)]
-    return fitted(seen, max(starts, key=lambda T: agreement(seen, T)), rounds=2)
+    found = []
+    for squares in (with_squares(seen, True), with_squares(seen, False)):
+        T = max(starts, key=lambda T: agreement(squares, T))
+        found.append((contrast_of(squares, T), squares, T))
+    clearest = max(contrast for contrast, _, _ in found)
+    if clearest < _FAINT_CONTRAST:
+        return None
+    fits_of = [
+        fitted(squares, T, rounds=2) for contrast, squares, T in found if contrast > clearest - _CLEARLY_LESS
+    ]
+    best = max(fits_of, key=lambda fit: agreement(fit.seen, fit.T_lidar_board))
+    return fitted(trimmed(best.seen, best.T_lidar_board), best.T_lidar_board)
 
 
 def _shifted(seen: Seen, fit: PoseFit) -> list[F8]:
