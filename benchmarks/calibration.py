@@ -1,6 +1,6 @@
 """Calibration: real placements against published solutions, and simulated rigs against truth.
 
-    python -m benchmarks.calibration [--data FOLDER] [--seeds 100] [--only real|rigs|starts|bad] [--json -]
+    python -m benchmarks.calibration [--data FOLDER] [--seeds 100] [--first 0] [--only real|rigs|starts|bad] [--json -]
 
 `real` needs the folder `lidar_camera_board` of real data; the others need nothing.
 """
@@ -47,14 +47,16 @@ def main() -> None:
     )
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--seeds", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--only", choices=("real", "rigs", "starts", "bad"), default=None)
     parser.add_argument("--json", default="")
     arguments = parser.parse_args()
+    seeds = range(arguments.first, arguments.first + arguments.seeds)
     runs = {
         "real": lambda: real(arguments.data / "lidar_camera_board"),
-        "rigs": lambda: rigs(arguments.seeds),
-        "starts": lambda: starts(arguments.seeds),
-        "bad": lambda: bad(arguments.seeds),
+        "rigs": lambda: rigs(seeds),
+        "starts": lambda: starts(seeds),
+        "bad": lambda: bad(seeds),
     }
     figures: list[Figure] = []
     for name, run in runs.items():
@@ -168,12 +170,12 @@ def _real_rows(scope: str, found: Found) -> Iterator[Figure]:
 # --- simulated -------------------------------------------------------------------------------------------------------
 
 
-def rigs(seeds: int) -> Iterator[Figure]:
+def rigs(seeds: range) -> Iterator[Figure]:
     """Three cameras, 12 placements, range noise 2 cm."""
     yield from _against_truth("rigs", seeds, lambda seed, scene, poses: calibrate(scene, CalibrateSettings()))
 
 
-def starts(seeds: int) -> Iterator[Figure]:
+def starts(seeds: range) -> Iterator[Figure]:
     """The same from starts that are 20 degrees and 0.5 m off."""
 
     def run(seed: int, scene: Scene, poses: dict[str, F8]) -> Found:
@@ -189,10 +191,10 @@ def _off(rng: np.random.Generator, turn_rad: float, shift_m: float) -> F8:
     return pose(so3_exp(turn_rad * axis / np.linalg.norm(axis)), shift_m * way / np.linalg.norm(way))
 
 
-def _against_truth(scope: str, seeds: int, run) -> Iterator[Figure]:  # type: ignore[no-untyped-def]
+def _against_truth(scope: str, seeds: range, run) -> Iterator[Figure]:  # type: ignore[no-untyped-def]
     """Errors of all cameras, and how many seeds have the truth within three sigma everywhere."""
     errors, within, refused = [], 0, 0
-    for seed in range(seeds):
+    for seed in seeds:
         scene, poses = simulate(World(), seed)
         with patch.object(story, "check", _unchecked):
             try:
@@ -211,7 +213,7 @@ def _against_truth(scope: str, seeds: int, run) -> Iterator[Figure]:  # type: ig
             inside &= bool((np.abs(xi) < SIGMAS * np.sqrt(np.diag(covariance))).all())
         within += inside
     deg, mm = np.array(errors).T
-    how = f"{len(errors)} cameras of {seeds} rigs"
+    how = f"{len(errors)} cameras of {len(seeds)} rigs"
     yield Figure(
         "calibration.error_rms_deg",
         float(np.sqrt((deg**2).mean())),
@@ -241,9 +243,9 @@ def _against_truth(scope: str, seeds: int, run) -> Iterator[Figure]:  # type: ig
         within,
         "",
         scope,
-        f"of {seeds} rigs, all cameras, every axis and all together",
+        f"of {len(seeds)} rigs, all cameras, every axis and all together",
     )
-    yield Figure("calibration.refused", refused, "", scope, f"of {seeds} rigs")
+    yield Figure("calibration.refused", refused, "", scope, f"of {len(seeds)} rigs")
 
 
 def _unchecked(*_: object) -> Checks:
@@ -251,10 +253,10 @@ def _unchecked(*_: object) -> Checks:
     return Checks({}, {}, {}, {}, {})
 
 
-def bad(seeds: int) -> Iterator[Figure]:
+def bad(seeds: range) -> Iterator[Figure]:
     """Three of 12 placements spoilt: the board moved by 8 cm between cloud and images, glare, another board."""
     named = falsely = refused = 0
-    for seed in range(seeds):
+    for seed in seeds:
         world = World()
         scene, poses = simulate(world, seed)
         spoilt, scene = _spoilt(world, scene, poses, np.random.default_rng(20_000 + seed))
@@ -269,21 +271,25 @@ def bad(seeds: int) -> Iterator[Figure]:
         named += spoilt <= left_out
         falsely += len(left_out - spoilt)
     yield Figure(
-        "calibration.bad_named", named, "", "3 bad of 12", f"of {seeds} rigs, all three named and left out"
+        "calibration.bad_named",
+        named,
+        "",
+        "3 bad of 12",
+        f"of {len(seeds)} rigs, all three named and left out",
     )
     yield Figure(
         "calibration.good_left_out",
         falsely,
         "",
         "3 bad of 12",
-        f"good placements with an image left out, {seeds} rigs",
+        f"good placements with an image left out, {len(seeds)} rigs",
     )
     yield Figure(
         "calibration.bad_refused",
         refused,
         "",
         "3 bad of 12",
-        f"of {seeds} rigs: too little left for a camera",
+        f"of {len(seeds)} rigs: too little left for a camera",
     )
 
 
