@@ -74,6 +74,29 @@ def test_an_extension_speaks_json(place: Path) -> None:
     assert answers(json.loads(done.stdout))
 
 
+def test_a_map_and_its_exports_in_one_command(place: Path) -> None:
+    laspy = pytest.importorskip("laspy")
+    done = scanloom("map", "log", "--out", "both", "--export", "laz,3dtiles", "--json", cwd=place)
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    points = json.loads((place / "both/map.json").read_text())["points"]
+    assert [row["format"] for row in said["exports"]] == ["laz", "3dtiles"] and said["failures"] == []
+    assert len(laspy.read(place / "both/exports/laz/map.laz").points) == points
+    assert (place / "both/exports/3dtiles/tileset.json").exists()
+
+
+def test_an_export_that_fails_costs_no_map(place: Path) -> None:
+    pytest.importorskip("laspy")
+    (place / "one/exports").mkdir(parents=True)
+    (place / "one/.scanloom").touch()
+    (place / "one/exports/.laz.part").write_text("a file where a folder should be made")
+    done = scanloom("map", "log", "--out", "one", "--export", "laz,3dtiles", cwd=place)
+    assert done.returncode == 3
+    assert "map: one" in done.stderr and "laz: cannot be written" in done.stderr and "Next:" in done.stderr
+    assert (place / "one/map.ply").read_bytes() == (place / "map/map.ply").read_bytes()
+    assert (place / "one/exports/3dtiles/tileset.json").exists() and not (place / "one/exports/laz").exists()
+
+
 def test_the_viewer_says_where_it_is_in_json(place: Path) -> None:
     command = [
         sys.executable,
