@@ -363,7 +363,9 @@ def inspect(
 def calibrate_command(
     session: Annotated[
         Path,
-        typer.Argument(help="Folder with clouds/, images/, camera_info.yaml (or camera_info/) and board.yaml."),
+        typer.Argument(
+            help="Folder with clouds/, images/, camera_info.yaml (or camera_info/) and board.yaml."
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder of the calibration and its pictures.")],
     board: Annotated[
