@@ -122,7 +122,7 @@ class Stranger:
 def strangers(found: Sequence[Pair], start: Mapping[str, F8], limit: float) -> list[Stranger]:
     """Pairs that do not fit, worst first, each judged by a calibration of its camera without it.
 
-    In units of what the others scatter by (their median). A camera keeps three pairs at least.
+    In units of what the others scatter by (their median). Of three that do not agree one goes, and two are too few to go on with.
     """
     kept = list(found)
     out: list[Stranger] = []
@@ -141,7 +141,7 @@ def strangers(found: Sequence[Pair], start: Mapping[str, F8], limit: float) -> l
 def _judged(kept: Sequence[Pair], i: int, start: Mapping[str, F8]) -> Stranger | None:
     pair = kept[i]
     others = [other for j, other in enumerate(kept) if j != i and other.camera == pair.camera]
-    if len(others) < 3:
+    if len(others) < 2:
         return None
     T, covariance = _agree(others, start[pair.camera])
     error, J = _slopes(pair, T)

@@ -19,7 +19,7 @@ _SCALE_OFF = 0.03
 _SCALE_SURE = 4.0
 _OTHER_LENS = 0.4
 """Corners that scatter by less than this share under another camera's lens are that camera's."""
-_LENS_PX = 0.4
+_LENS_PX = 0.08
 """Scatter from which a lens is doubted at all."""
 _BLURRED = 5.0
 _ALIKE_SHARE = 0.5
