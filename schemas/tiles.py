@@ -53,6 +53,27 @@ class Piece(Table):
 
 
 @dataclass(frozen=True)
+class Paint(Table):
+    """What the images of one stretch add to the colour of one tile. One part per tile; rows are ordered by `voxel`.
+
+    Sums are whole numbers, so that they do not depend on the order in which they are added.
+    """
+
+    NAME: ClassVar[str] = "paint"
+    ON_THE_WAY: ClassVar[bool] = True
+    SPLIT_BY: ClassVar[str] = "tile"
+    WEIGHT_STEPS: ClassVar[int] = 1 << 16
+    LIGHT_STEPS: ClassVar[int] = 1 << 24
+
+    voxel: NDArray[np.int64] = column("i8", "voxel, as in `piece`; of points of the map only")
+    weight: NDArray[np.int64] = column("i8", "sum of the weights of the views, in steps of 2^-16")
+    light: NDArray[np.int64] = column(
+        "i8", "sum of weight times linear red, green, blue, in steps of 2^-24", shape=(3,)
+    )
+    views: NDArray[np.int32] = column("i4", "images that saw the voxel")
+
+
+@dataclass(frozen=True)
 class Tile(Table):
     """Points of one tile, voxel-filtered, from the tile's own origin. One part per tile.
 
@@ -62,7 +83,7 @@ class Tile(Table):
     """
 
     NAME: ClassVar[str] = "tile"
-    SCHEMA_VERSION: ClassVar[int] = 2
+    SCHEMA_VERSION: ClassVar[int] = 3
     SPLIT_BY: ClassVar[str | None] = "tile"
     ALONE: ClassVar[int] = 3
 
@@ -88,6 +109,10 @@ class Tile(Table):
         shape=(3,),
         frame="world or map",
     )
+    colour: NDArray[np.uint8] = column(
+        "u1", "red, green, blue (sRGB) from images; zeros where none saw it", shape=(3,)
+    )
+    views: NDArray[np.uint16] = column("u2", "images that the colour is from; 0 where none saw it")
     offset_m: tuple[float, ...] = attribute("add to the coordinates to get the map's frame, doubles, m")
     frame: str = attribute("`world` or `map`")
     georeference: dict[str, Any] | None = attribute("fields of `frames.Georeference`, or null")
@@ -172,7 +197,7 @@ class Overview(Tile):
     """
 
     NAME: ClassVar[str] = "overview_cloud"
-    SCHEMA_VERSION: ClassVar[int] = 1
+    SCHEMA_VERSION: ClassVar[int] = 2
     SPLIT_BY: ClassVar[str | None] = None
 
     tile: NDArray[np.int32] = column("i4", "number of the tile in the order of the index")

@@ -26,6 +26,7 @@ def tile_of(
         "intensity": np.zeros(n, np.float32), "class_": np.full(n, class_, np.uint8), "count": np.ones(n, np.int32),
         "level": np.zeros(n, np.uint8), "first_ns": np.zeros(n, np.int64), "last_ns": np.zeros(n, np.int64),
         "session": np.zeros(n, np.uint16), "normal": np.zeros((n, 3), np.int8),
+        "colour": np.zeros((n, 3), np.uint8), "views": np.zeros(n, np.uint16),
     }  # fmt: skip
     tile = kind(
         x_m=x, y_m=y, z_m=z, **(usual | columns), offset_m=offset_m, frame="world" if georeference else "map",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 VERTEX = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("class", "u1")]
 )  # packed: 17 bytes a point
+COLOURED = np.dtype([*VERTEX.descr, ("red", "u1"), ("green", "u1"), ("blue", "u1")])
 _TYPES = {"<f4": "float", "<f8": "double", "<i4": "int", "|u1": "uchar"}
 
 
@@ -23,9 +24,16 @@ def header(points: int, comments: Sequence[str], vertex: np.dtype[Any] = VERTEX)
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii", "replace")
 
 
-def vertices(points: NDArray[np.float32], intensity: NDArray[np.float32], class_: NDArray[np.uint8]) -> bytes:
-    """Bytes of the vertices: points (n, 3), m; intensity (n,); class (n,)."""
-    out = np.empty(len(points), VERTEX)
+def vertices(
+    points: NDArray[np.float32],
+    intensity: NDArray[np.float32],
+    class_: NDArray[np.uint8],
+    colour: NDArray[np.uint8] | None = None,
+) -> bytes:
+    """Bytes of the vertices: points (n, 3), m; intensity (n,); class (n,); with colour (n, 3) they are `COLOURED`."""
+    out = np.empty(len(points), VERTEX if colour is None else COLOURED)
+    if colour is not None:
+        out["red"], out["green"], out["blue"] = colour.T
     out["x"], out["y"], out["z"] = points[:, 0], points[:, 1], points[:, 2]
     out["intensity"], out["class"] = intensity, class_
     return out.tobytes()

@@ -13,15 +13,16 @@ from pydantic import BaseModel, ConfigDict, Field
 from scanloom.schemas.errors import StageError
 from scanloom.schemas.product import Parts, column, columns_of
 from scanloom.schemas.scans import PointClass
-from scanloom.schemas.tiles import LEFT_OUT, RANK_SHIFT, Piece, RemovedTile, Tile, TileFiles
+from scanloom.schemas.tiles import LEFT_OUT, RANK_SHIFT, Paint, Piece, RemovedTile, Tile, TileFiles
 from scanloom.stages.geometry import ply
 from scanloom.stages.geometry.kernels import kernel
+from scanloom.stages.geometry.normals import normals
+from scanloom.stages.tiling.colours import coloured
 from scanloom.stages.tiling.grid import tile_position
 from scanloom.stages.tiling.levels import ordered
-from scanloom.stages.tiling.normals import normals
 from scanloom.stages.tiling.voxel_sums import STEP_X, STEP_Y
 
-VERSION = 2
+VERSION = 3
 
 I8 = NDArray[np.int64]
 
@@ -49,11 +50,13 @@ class Met(Piece):
     session: NDArray[np.uint16] = column("u2", "number of the session that met the voxel first")
 
 
-def tiles(settings: Settings, pieces: Parts[Piece]) -> tuple[Tile, RemovedTile, TileFiles]:
+def tiles(
+    settings: Settings, pieces: Parts[Piece], paints: Parts[Paint] | None = None
+) -> tuple[Tile, RemovedTile, TileFiles]:
     """Merge the pieces of one tile: the mean point, mean intensity and majority class of every voxel, its normal, when
     and by whom it was met; then order the points by level of detail.
 
-    What is left out of the map is averaged likewise, class by class. The sums are exact (see `voxel_sums`), hence the tile
+    Points that images saw get the mean of their views as colour. What is left out of the map is averaged likewise, class by class, and has no colour. The sums are exact (see `voxel_sums`), hence the tile
     does not depend on the order of the pieces.
 
     Raises
@@ -65,8 +68,13 @@ def tiles(settings: Settings, pieces: Parts[Piece]) -> tuple[Tile, RemovedTile, 
     first_out = int(np.searchsorted(merged.voxel, 1 << RANK_SHIFT))
     of_map, left_out = merged.take(slice(0, first_out)), merged.take(slice(first_out, None))
     kept = of_map.take((of_map.count >= settings.min_points) & (of_map.scan_count >= settings.min_scans))
-    tile = _ordered(Tile(**_average(kept, name, sessions), class_=_scenery(kept)))
-    removed = _ordered(RemovedTile(**_average(left_out, name, sessions), class_=_left_out(left_out)))
+    colour = coloured(kept.voxel, paints or ())
+    tile = _ordered(Tile(**_average(kept, name, sessions), **colour, class_=_scenery(kept)))
+    removed = _ordered(
+        RemovedTile(
+            **_average(left_out, name, sessions), **coloured(left_out.voxel, ()), class_=_left_out(left_out)
+        )
+    )
     return tile, removed, TileFiles(contents={"tile.ply": tile_ply(tile)})
 
 
@@ -233,4 +241,6 @@ def tile_ply(tile: Tile) -> bytes:
     """The tile as PLY: coordinates from the tile's origin, the origin and the CRS in the comments."""
     comments = ["scanloom tile", *ply.georeference_comments(tile.frame, tile.georeference, tile.offset_m)]
     points = np.column_stack((tile.x_m, tile.y_m, tile.z_m))
-    return ply.header(len(tile), comments) + ply.vertices(points, tile.intensity, tile.class_)
+    colour = tile.colour if tile.views.any() else None
+    vertex = ply.VERTEX if colour is None else ply.COLOURED
+    return ply.header(len(tile), comments, vertex) + ply.vertices(points, tile.intensity, tile.class_, colour)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scanloom.stages.tiling.normals import normals
+from scanloom.stages.geometry.normals import normals
 
 SIDE, HEIGHT = 1 << 29, 1 << 19
 

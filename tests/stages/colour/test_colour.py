@@ -1,0 +1,153 @@
+"""Colour: what a camera saw gets its colour, what it did not see gets none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scanloom.schemas.objects import ObjectTracks
+from scanloom.schemas.tiles import Tile
+from scanloom.stages.colour.light import gain
+from scanloom.stages.geometry import ply
+from scanloom.stages.geometry.se3 import pose
+from scanloom.stages.geometry.srgb import LINEAR, srgb
+from tests.stages.colour.scene import (
+    BOX,
+    BOX_HALF_M,
+    BOX_X_M,
+    CAMERA,
+    LEFT,
+    RIGHT,
+    START,
+    WALL_X_M,
+    image,
+    painted,
+    path,
+    picture,
+    tile,
+)  # fmt: skip
+
+
+def groups(made: Tile) -> dict[str, np.ndarray]:
+    """Rows: the box, the wall left and right of it, and what it hides; clear of all edges by 0.5 m."""
+    x, y, z = made.x_m, made.y_m - 25.0, made.z_m - 3.0
+    wall = x > WALL_X_M - 0.5
+    hidden = BOX_HALF_M * (WALL_X_M - START[0]) / (BOX_X_M - START[0])
+    within = np.maximum(np.abs(y), np.abs(z))
+    clear = wall & (np.abs(z) < 2.4) & (np.abs(y) < 5.4) & (within > hidden + 0.5) & (np.abs(y) > 0.4)
+    return {
+        "box": ~wall & (within < BOX_HALF_M - 0.3),
+        "left": clear & (y > 0),
+        "right": clear & (y < 0),
+        "hidden": wall & (within < hidden - 0.1),
+        "edge": wall & (within < hidden + 0.05),
+    }
+
+
+def test_points_get_the_colour_of_what_the_camera_saw() -> None:
+    made = tile(painted([image(picture())], path(1), grey=0.1))
+    rows = groups(made)
+    mean = {name: LINEAR[made.colour[rows[name]]].mean(axis=0) for name in ("box", "left", "right")}
+    for name, light in (("box", BOX), ("left", LEFT), ("right", RIGHT)):
+        assert (made.views[rows[name]] == 1).all(), name
+        assert mean[name] / mean[name].max() == pytest.approx(light / light.max(), abs=0.02), name
+
+
+def test_what_is_hidden_or_beside_an_edge_gets_no_colour() -> None:
+    made = tile(painted([image(picture())], path(1)))
+    rows = groups(made)
+    assert rows["hidden"].sum() > 500
+    for name in ("hidden", "edge"):
+        assert not made.views[rows[name]].any(), name
+        assert not made.colour[rows[name]].any(), name
+
+
+def test_without_an_image_that_saw_it_nothing_has_a_colour() -> None:
+    made = tile([])
+    assert not made.views.any()
+    assert not made.colour.any()
+    assert painted([], path(1)) == []
+    assert painted([image(picture(), camera="rear")], path(1)) == []
+    assert (
+        painted([image(picture())], path(1), camera=CAMERA.model_copy(update={"T_lidar_camera": None})) == []
+    )
+    assert painted([image(picture(), n=3)], path(2)) == [], "the path is not known at that time"
+
+
+def test_images_are_brought_to_one_exposure() -> None:
+    poses = path(2, step_m=0.5)
+    even = tile(painted([image(picture()), image(picture(START + (0, 0.5, 0)), 1)], poses))
+    dark = tile(painted([image(picture()), image(picture(START + (0, 0.5, 0), 0.4), 1)], poses))
+    twice = (even.views == 2) & (dark.views == 2)
+    assert twice.sum() > 3000
+    off = np.abs(even.colour[twice].astype(int) - dark.colour[twice])
+    assert np.median(off) <= 1
+    assert np.quantile(off, 0.95) <= 6
+
+
+def test_saturated_and_black_pixels_give_no_colour() -> None:
+    bright, black = np.full((400, 640, 3), 251, np.uint8), np.full((400, 640, 3), 5, np.uint8)
+    assert painted([image(bright)], path(1)) == []
+    assert painted([image(black)], path(1)) == []
+    assert len(painted([image(bright - 1)], path(1))) == 1
+    assert len(painted([image(black + 1)], path(1))) == 1
+
+
+def test_what_stands_behind_a_moving_thing_gets_no_colour() -> None:
+    box = pose(np.eye(3), np.array([10.0, 3.0, -3.0]))[None]
+    track = ObjectTracks(
+        scan_index=np.zeros(1, np.int64), stamp_ns=path(1).stamp_ns, track=np.zeros(1, np.int32), T_odom_object=box,
+        T_lidar_object=box, length_m=np.ones(1), width_m=np.full(1, 2.0), height_m=np.full(1, 6.0), speed_m_s=np.zeros(1),
+        class_=np.ones(1, np.uint8), dynamic=np.ones(1, bool), score=np.ones(1),
+    )  # fmt: skip
+    made = tile(painted([image(picture())], path(1), track))
+    y = made.y_m - 25.0
+    wall = (made.x_m > 19.5) & (np.abs(made.z_m - 3.0) < 2.4)
+    behind = wall & (y > 2.9) & (y < 5.5)
+    assert behind.sum() > 500
+    assert not made.views[behind].any()
+    assert made.views[wall & (y < -2.9) & (y > -5.4)].all()
+    parked = replace(track, dynamic=np.zeros(1, bool))
+    assert tile(painted([image(picture())], path(1), parked)).views[behind & (y > 3.0) & (y < 5.3)].all()
+
+
+def test_far_and_near_points_get_no_colour_from_an_image() -> None:
+    wall_m = WALL_X_M - START[0]
+    assert (
+        not tile(painted([image(picture())], path(1), reach_m=wall_m - 0.5))
+        .views[groups(tile([]))["left"]]
+        .any()
+    )
+    assert (
+        tile(painted([image(picture())], path(1), nearest_m=wall_m - 1)).views[groups(tile([]))["left"]].all()
+    )
+    assert (
+        not tile(painted([image(picture())], path(1), nearest_m=wall_m - 1))
+        .views[groups(tile([]))["box"]]
+        .any()
+    )
+
+
+def test_gain_is_the_median_and_needs_enough_points() -> None:
+    before = np.full((300, 3), 0.2)
+    now = before * 0.5
+    now[:100] = 0.9
+    assert gain(now, before, 300) == pytest.approx(2.0)
+    assert gain(now[:299], before[:299], 300) is None
+
+
+def test_values_of_srgb_come_back() -> None:
+    assert np.array_equal(srgb(LINEAR), np.arange(256))
+
+
+def test_a_tile_with_colour_has_it_in_its_ply() -> None:
+    from scanloom.stages.tiling.tiles import tile_ply
+
+    made = tile(painted([image(picture())], path(1)))
+    head, _, body = tile_ply(made).partition(b"end_header\n")
+    assert b"property uchar red" in head
+    rows = np.frombuffer(body, ply.COLOURED)
+    assert np.array_equal(np.column_stack([rows[c] for c in ("red", "green", "blue")]), made.colour)
+    assert b"red" not in tile_ply(tile([])).partition(b"end_header\n")[0]
