@@ -59,8 +59,7 @@ def airborne(moment: Moment) -> B1:
     odds = np.full(len(view.scan), -LIMIT, np.float32)
     odds[asked] = first = log_odds(found, weights.FIRST)
     for offsets, kind in ((NEAR, AGAIN_NEAR), (FAR, AGAIN_FAR)):
-        left = first > LEAST_ODDS
-        asked, found = asked[left], found[left]
+        asked, found = _in_doubt(asked, found, first)
         found[:, kind] = answers(moment, offsets, asked)
         odds[asked] = first = log_odds(found, weights.FIRST)
     frame = view.frame
@@ -71,7 +70,7 @@ def airborne(moment: Moment) -> B1:
     flake = log_odds(found, weights.FLAKE) + weights.CONTEXT_FLAKE[around]
     cloud = log_odds(found, weights.CLOUD) + weights.CONTEXT_CLOUD[around]
     by_flakes, by_clouds = shifts(flake, cloud, drawn)
-    out[asked] = np.logaddexp(flake + by_flakes, cloud + by_clouds) > 0.0
+    out[asked] = np.exp(flake + by_flakes) + np.exp(cloud + by_clouds) > 1.0
     return out
 
 
@@ -96,14 +95,41 @@ def shifts(flake: F8, cloud: F8, points: int) -> tuple[float, float]:
     Expectation and maximisation of a mixture's weights, solid things being the third. In clear air not all of it counts,
     since particles keep to places.
     """
-    usual = np.log(weights.SHARES / (1.0 - weights.SHARES))
-    risen, shift = np.exp(np.clip(np.stack((flake, cloud)), -MOST_ODDS, MOST_ODDS)), np.zeros(2)
+    usual, shift = np.log(weights.SHARES / (1.0 - weights.SHARES)), np.zeros(2)
+    flakes, clouds = (np.exp(np.clip(odds, -MOST_ODDS, MOST_ODDS)) for odds in (flake, cloud))
     for _ in range(STEPS):
-        weighed = risen * np.exp(shift)[:, None]
-        share = np.clip((weighed / (1.0 + weighed.sum(axis=0))).sum(axis=1) / points, LEAST_SHARE, 0.5)
+        share = np.clip(_shared(flakes, clouds, np.exp(shift)) / points, LEAST_SHARE, 0.5)
         shift = np.log(share / (1.0 - share)) - usual
     capped = np.where(shift > 0.0, np.minimum(shift, MOST_SHIFT), CLEAR_AIR * shift)
     return float(capped[0]), float(capped[1])
+
+
+@kernel
+def _shared(flake: F8, cloud: F8, weight: F8) -> F8:
+    """How many of the points (m,), with odds `flake` and `cloud` against solid things, are flakes and clouds (2,)."""
+    out = np.zeros(2)
+    for m in range(len(flake)):
+        a, b = weight[0] * flake[m], weight[1] * cloud[m]
+        part = 1.0 / (1.0 + a + b)
+        out[0] += a * part
+        out[1] += b * part
+    return out
+
+
+@kernel
+def _in_doubt(asked: I8, found: U1, odds: F4) -> tuple[I8, U1]:
+    """Those of the points `asked` (m,) and of their bins (m, KINDS) that further evidence may make airborne."""
+    left, count = np.empty(len(asked) + 1, np.int64), 0
+    for m in range(len(asked)):
+        left[count] = m
+        count += odds[m] > LEAST_ODDS
+    rows, bins = np.empty(count, np.int64), np.empty((count, KINDS), np.uint8)
+    for k in range(count):
+        m = left[k]
+        rows[k] = asked[m]
+        for kind in range(KINDS):
+            bins[k, kind] = found[m, kind]
+    return rows, bins
 
 
 @kernel

@@ -51,10 +51,12 @@ def answers(moment: Moment, offsets: tuple[int, ...], asked: I8) -> U1:
 
 def met_again(moment: Moment, asked: I8) -> B1:
     """Which of the points `asked` (m,) a neighbouring scan has a point near, too; none when no scan can be asked."""
-    out = np.zeros(len(asked), np.bool_)
+    out, left = np.zeros(len(asked), np.bool_), np.arange(len(asked))
     for offsets in (NEAR, FAR):
-        said = answers(moment, offsets, asked)
-        out |= (said >= MET) & (said < NOT_ASKED)
+        said = answers(moment, offsets, asked[left])
+        met = (said >= MET) & (said < NOT_ASKED)
+        out[left[met]] = True
+        left = left[~met]
     return out
 
 
