@@ -14,7 +14,16 @@ from scanloom.pipeline.run import Result, run
 from scanloom.pipeline.store import Store
 from scanloom.workflows.build_map import Order, request_of
 
-SMALL = {"simulate": {"size": "small"}}
+SMALL = {
+    "simulate": {
+        "size": "small",
+        "cameras": 1,
+        "camera_width_px": 160,
+        "camera_height_px": 100,
+        "camera_rate_hz": 1.0,
+    }
+}
+"""With a camera, so that every stage has something to do."""
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,8 @@ PACKAGES = ("schemas", "stages", "pipeline", "workflows")
 BARE_SCANS = 12
 CHUNK_S = 2.0
 """Several chunks, so that what merges them is compiled, too."""
+CAMERA = {"cameras": 1, "camera_width_px": 160, "camera_height_px": 100, "camera_rate_hz": 1.0}
+"""A few small images, for what only images ask for."""
 
 
 def is_warm() -> bool:
@@ -70,7 +72,7 @@ def _map(session: str, folder: Path) -> Result:
         name=Path(session).name,
         store=folder / "store",
         cluster="none",
-        command_line={"simulate": {"size": "small"}, "ingest": {"chunk_s": CHUNK_S}},
+        command_line={"simulate": {"size": "small"} | CAMERA, "ingest": {"chunk_s": CHUNK_S}},
     )
     outcome = build_map(order)
     for _, error in outcome.failures:

@@ -12,7 +12,7 @@ from scanloom.schemas.tiles import Paint
 from scanloom.stages.geometry.srgb import srgb
 
 
-def coloured(voxel: NDArray[np.int64], paints: Iterable[Paint]) -> dict[str, NDArray[Any]]:
+def coloured(voxel: NDArray[np.int64], paints: Iterable[Paint]) -> dict[str, Any]:
     """Columns `colour` and `views` of the voxels (n,), ascending; zeros for those that no image saw.
 
     Sums are whole numbers: the result does not depend on the order of the paints.

@@ -31,6 +31,7 @@ CONTENT_WITH_NOTHING = {
     "changes",
     "images",
     "camera_check",
+    "colour",
     "truth",
     "overview",
     "tiles",
@@ -48,7 +49,7 @@ CONTENT_WITH_NOTHING = {
     "rays",
     "relabel",
 }
-"""May answer emptiness with an empty product (no truth, no windows, no tiles, no loops) instead of an error."""
+"""May answer emptiness with an empty product (no truth, no images, no windows, no tiles, no loops) instead of an error."""
 
 
 @pytest.fixture(scope="module")
