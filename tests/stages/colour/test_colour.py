@@ -78,8 +78,8 @@ def test_without_an_image_that_saw_it_nothing_has_a_colour() -> None:
 
 def test_images_are_brought_to_one_exposure() -> None:
     poses = path(2, step_m=0.5)
-    even = tile(painted([image(picture()), image(picture((*START, 0, 0.5, 0)), 1)], poses))
-    dark = tile(painted([image(picture()), image(picture((*START, 0, 0.5, 0), 0.4), 1)], poses))
+    even = tile(painted([image(picture()), image(picture(START + np.array((0.0, 0.5, 0.0))), 1)], poses))
+    dark = tile(painted([image(picture()), image(picture(START + np.array((0.0, 0.5, 0.0)), 0.4), 1)], poses))
     twice = (even.views == 2) & (dark.views == 2)
     assert twice.sum() > 3000
     off = np.abs(even.colour[twice].astype(int) - dark.colour[twice])
