@@ -104,15 +104,12 @@ def paint(folder: Path) -> None:
         table = pq.read_table(path)
         tile = table["tile"].to_numpy() if path.stem == "overview" else names.index(path.stem)
         x_m = table["x_m"].to_numpy() + across[tile]
-        colours = {
-            "red": np.clip(x_m * 8.0, 1, 255),
-            "green": np.zeros(len(x_m)),
-            "blue": np.full(len(x_m), 255),
-        }
-        painted = table
-        for name, value in colours.items():
-            column = np.where(x_m > 0.0, value, 0).astype(np.uint8)
-            painted = painted.append_column(name, pa.array(column))
+        rgb = np.column_stack((np.clip(x_m * 8.0, 1, 255), np.zeros(len(x_m)), np.full(len(x_m), 255)))
+        rgb = np.where(x_m[:, None] > 0.0, rgb, 0).astype(np.uint8)
+        colour = pa.FixedSizeListArray.from_arrays(pa.array(rgb.ravel()), 3)
+        painted = table.set_column(table.schema.get_field_index("colour"), "colour", colour)
+        views = pa.array((x_m > 0.0).astype(np.uint16))
+        painted = painted.set_column(painted.schema.get_field_index("views"), "views", views)
         footer = {FOOTER_KEY: pq.read_metadata(path).metadata[FOOTER_KEY]}
         pq.write_table(painted.replace_schema_metadata(footer), path, write_page_checksum=True)
 

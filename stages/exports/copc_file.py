@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.stages.exports.coordinates import Projector
-from scanloom.stages.exports.las_points import RECORD, SCALE_M, Records, Rows, las_header, places_of
+from scanloom.stages.exports.las_points import SCALE_M, Records, Rows, las_header, places_of
 from scanloom.stages.exports.octree import CELLS, Key, Octree
 
 ENTRY = np.dtype(
@@ -41,7 +41,7 @@ class CopcFile:
 
         self._octree, self._records = octree, records
         self._vlr = lazrs.LazVlr.new_for_compression(
-            *(records.point_format, RECORD.itemsize - records.standard_bytes), use_variable_size_chunks=True
+            *(records.point_format, records.extra_bytes), use_variable_size_chunks=True
         )
         self._header = las_header(projector, records)
         self._header.are_points_compressed = True
@@ -59,7 +59,7 @@ class CopcFile:
         self._summary = _Summary()
 
     def node(self, key: Key, rows: Rows) -> None:
-        """Add the points (n,) of `RECORD` of one node, n > 0."""
+        """Add the points (n,) of one node, n > 0."""
         self._keys.append(key)
         self._points.append(len(rows))
         self._summary.add(rows)

@@ -1,11 +1,11 @@
-"""Points as records of LAS 1.4, point format 6 with extra bytes; LAZ and COPC share them."""
+"""Points as records of LAS 1.4, point format 6 with extra bytes, or 7 where cameras saw the map; LAZ and COPC share them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,11 @@ RECORD = np.dtype(
     ]
 )  # fmt: skip
 """`point_source_id` is the number of the session, from 1."""
+_COLOUR: Any = [("red", "<u2"), ("green", "<u2"), ("blue", "<u2")]
+COLOURED = np.dtype([*RECORD.descr[:11], *_COLOUR, *RECORD.descr[11:]])
+"""The same as point format 7; black where no camera saw a point."""
+_COLOUR_STEPS = 257
+"""From 8 bits to 16, as the standard asks for."""
 NORMAL_STEPS = 127.0
 EXTRA_BYTES: tuple[tuple[str, str, str, float | None], ...] = (
     ("count", "u4", "measured points averaged", None),
@@ -80,12 +85,24 @@ class Records:
     intensity_scale: float
     unix_time: bool
     """Whether stamps are seconds since 1970; else `gps_time` is the log's own clock, s."""
+    coloured: bool
+    """Whether any point has a colour."""
     last_day: date
     """Of the last stamp; files are dated so, since two exports of one map shall be the same bytes."""
 
-    point_format: ClassVar[int] = 6
-    standard_bytes: ClassVar[int] = 30
-    """Of a record of that format; the extra bytes follow."""
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of a record."""
+        return COLOURED if self.coloured else RECORD
+
+    @property
+    def point_format(self) -> int:
+        return 7 if self.coloured else 6
+
+    @property
+    def extra_bytes(self) -> int:
+        """Of a record, behind what its format has."""
+        return self.dtype.itemsize - (36 if self.coloured else 30)
 
     @classmethod
     def of(cls, source: MapSource, projector: Projector, options: Options) -> Records:
@@ -95,13 +112,14 @@ class Records:
             offset_m=round_offset_m(source, projector),
             intensity_scale=intensity_scale(strongest),
             unix_time=first_ns >= GPS_EPOCH_S * NS_PER_S,
+            coloured=source.coloured,
             last_day=datetime.fromtimestamp(last_ns // NS_PER_S, UTC).date(),
         )
 
     def __call__(self, cloud: Cloud) -> Rows:
-        """Packed rows (n,) of `RECORD`."""
+        """Packed rows (n,) of `dtype`."""
         tile = cloud.tile
-        out = np.zeros(len(cloud), RECORD)
+        out = np.zeros(len(cloud), self.dtype)
         for axis, name in enumerate("XYZ"):
             out[name] = np.rint((cloud.xyz[:, axis] - self.offset_m[axis]) / SCALE_M)
         out["intensity"] = np.clip(np.rint(tile.intensity * np.float64(self.intensity_scale)), 0, 65535)
@@ -111,6 +129,9 @@ class Records:
         out["point_source_id"] = tile.session + 1
         out["gps_time"] = gps_time(tile.first_ns) if self.unix_time else tile.first_ns / NS_PER_S
         out["count"], out["level"] = tile.count, tile.level
+        if self.coloured:
+            for axis, name in enumerate(("red", "green", "blue")):
+                out[name] = tile.colour[:, axis] * np.uint16(_COLOUR_STEPS)
         steps = np.rint(cloud.normals * NORMAL_STEPS)
         for axis, name in enumerate("xyz"):
             out[f"normal_{name}"] = steps[:, axis]

@@ -17,12 +17,12 @@ from scanloom.schemas.errors import InvalidInput
 from scanloom.schemas.product import FOOTER_KEY
 from scanloom.stages.exports.glb import VERTEX, glb
 from scanloom.stages.exports.nodes import ROOT_POINTS, Levels, Node, door_level, tile_nodes, tree
-from scanloom.stages.exports.source import MapSource
+from scanloom.stages.exports.source import MapSource, any_coloured
 
 Columns = dict[str, NDArray[Any]]
 COLUMNS = ("x_m", "y_m", "z_m", "intensity", "class_", "count", "first_ns", "last_ns", "session", "normal")
-COLOUR = ("red", "green", "blue")
-"""Columns that tiles have where cameras saw the map; black stands for a point that none saw."""
+COLOUR = ("colour",)
+"""Read where cameras saw the map; black stands for a point that none saw."""
 CACHE_BYTES = 256 << 20
 UNCLASSIFIED, STATIC, GROUND = 0, 2, 1
 _TINTS = {GROUND: (0.93, 0.86, 0.74), STATIC: (0.80, 0.90, 1.0)}
@@ -207,19 +207,8 @@ class NodeReader:
         return int(fits[0])
 
     def _has_colour(self) -> bool:
-        """Whether any cloud of the map has colours; one that is not there says so when it is read."""
-        paths = [
-            self._overview,
-            *(self.source.folder / "tiles" / f"{name}.parquet" for name in self.levels.names[:1]),
-        ]
-        try:
-            return any(
-                set(COLOUR) <= set(pq.read_schema(path, memory_map=False).names)
-                for path in paths
-                if path.exists()
-            )
-        except (OSError, ValueError):
-            return False
+        """Whether cameras saw any point of the map; the overview alone tells, where there is one."""
+        return any_coloured(self._overview) if self._overview.exists() else self.source.coloured
 
     def _read(self, path: Path, first: int, last: int) -> Columns:
         """Rows of a file, from the row groups that hold them."""
@@ -236,8 +225,6 @@ class NodeReader:
             ) from error
         table = table.slice(first - int(begins[groups[0]]), last - first)
         columns = {name: _numpy(table.column(name)) for name in known}
-        for name in set(COLOUR * self.coloured) - set(known):
-            columns[name] = np.zeros(len(table), np.uint8)
         columns["session"] = self._renumbered(file, columns["session"])
         return columns
 
@@ -257,7 +244,7 @@ def vertices(points: Points, centre_m: NDArray[np.float64]) -> NDArray[Any]:
     out["position"] = points.xyz_m - centre_m
     out["colour"] = _colours(points.columns["intensity"], points.columns["class_"])
     if COLOUR[0] in points.columns:
-        seen = np.column_stack([points.columns[name] for name in COLOUR])
+        seen = points.columns[COLOUR[0]]
         coloured = seen.any(axis=1)
         out["colour"][coloured, :3] = seen[coloured]
     out["intensity"] = points.columns["intensity"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,8 @@ VERTEX = np.dtype(
         ("last_s", "<f8"),
     ]
 )
+COLOURED = np.dtype([*VERTEX.descr, ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("views", "<i4")])
+"""Where cameras saw the map; black and 0 where none saw a point."""
 _S_PER_NS = 1e-9
 
 
@@ -49,17 +52,21 @@ def write_ply(source: MapSource, folder: Path, options: Options) -> list[Path]:
         "class 1 ground, 2 static; first_s last_s: seconds of the log's clock, mostly since 1970",
         *(f"session {number} {name}" for number, name in enumerate(session_names(source))),
     ]
+    vertex = COLOURED if source.coloured else VERTEX
     with path.open("wb") as stream:
-        stream.write(ply.header(points_of(source, options), comments, VERTEX))
+        stream.write(ply.header(points_of(source, options), comments, vertex))
         for cloud in clouds(source, projector, options):
-            stream.write(vertices(cloud, offset_m).data)
+            stream.write(vertices(cloud, offset_m, vertex).data)
     return [path, write_placement(folder / "map.json", projector, offset_m)]
 
 
-def vertices(cloud: Cloud, offset_m: NDArray[np.float64]) -> NDArray[np.void]:
-    """Packed rows (n,) of `VERTEX`."""
+def vertices(cloud: Cloud, offset_m: NDArray[np.float64], vertex: np.dtype[Any]) -> NDArray[np.void]:
+    """Packed rows (n,) of `vertex`, which is `VERTEX` or `COLOURED`."""
     tile, normals = cloud.tile, cloud.normals
-    out = np.empty(len(cloud), VERTEX)
+    out = np.empty(len(cloud), vertex)
+    if vertex == COLOURED:
+        out["red"], out["green"], out["blue"] = tile.colour.T
+        out["views"] = tile.views
     for axis, name in enumerate("xyz"):
         out[name] = cloud.xyz[:, axis] - offset_m[axis]
         out[f"n{name}"] = normals[:, axis]

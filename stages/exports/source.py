@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
+
+import pyarrow.parquet as pq
 
 from scanloom.schemas.errors import InvalidInput, ProductError
 from scanloom.schemas.frames import Georeference
@@ -35,6 +38,20 @@ def opened(kind: type[T], path: Path) -> T:
             where=str(path),
             next_step="make the map whole by the `scanloom map` command that made it: what the store holds is not computed again",
         ) from error
+
+
+def any_coloured(path: Path) -> bool:
+    """Whether a file of tiles has a point that a camera saw, from its footer alone; one that is not there says so when
+    it is read."""
+    try:
+        metadata = pq.read_metadata(path)
+    except (OSError, ValueError):
+        return False
+    columns = {metadata.schema.column(i).path: i for i in range(metadata.num_columns)}
+    if "views" not in columns:
+        return False
+    kept = (metadata.row_group(n).column(columns["views"]).statistics for n in range(metadata.num_row_groups))
+    return any(each is not None and each.has_min_max and each.max > 0 for each in kept)
 
 
 @dataclass(frozen=True)
@@ -92,6 +109,11 @@ class MapSource:
         for name in self.tile_names:
             yield name, self.tile(name)
             self.passed()
+
+    @cached_property
+    def coloured(self) -> bool:
+        """Whether cameras saw any point of the map."""
+        return any(any_coloured(self.folder / "tiles" / f"{name}.parquet") for name in self.tile_names)
 
     @property
     def points(self) -> int:

@@ -158,7 +158,7 @@ class Answers:
             "normal": (value["normal"] / 127.0).tolist() if value["normal"].any() else None,
         }
         if self.reader.coloured:
-            about["colour"] = [int(value[name]) for name in COLOUR]
+            about["colour"] = value[COLOUR[0]].tolist()
         return about | self._place(xyz)
 
     def _place(self, xyz: NDArray[np.float64]) -> Json:

@@ -86,3 +86,11 @@ def column(source: MapSource, name: str) -> np.ndarray:
 
 def sorted_rows(rows: np.ndarray) -> np.ndarray:
     return rows[np.lexsort(rows.T)]
+
+
+def colours(seed: int, n: int) -> dict[str, np.ndarray]:
+    """What cameras saw: every third point not at all."""
+    rng = np.random.default_rng(seed + 2)
+    seen = np.arange(n) % 3 > 0
+    colour = np.where(seen[:, None], rng.integers(1, 256, (n, 3)), 0).astype(np.uint8)
+    return {"colour": colour, "views": np.where(seen, rng.integers(1, 60000, n), 0).astype(np.uint16)}
