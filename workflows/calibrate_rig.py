@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,22 +26,32 @@ from scanloom.stages.calibrate.image import ImageBoard, find_corners, pattern_se
 from scanloom.stages.calibrate.pictures import picture
 from scanloom.stages.calibrate.scene import Placement, Scene
 from scanloom.stages.calibrate.settings import CalibrateSettings
+from scanloom.stages.calibrate.standstill import StandstillSettings
 from scanloom.stages.calibrate.view import LidarView
 from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.logs import camera_options, options
 from scanloom.workflows.calibration_folder import (
     CalibrationSession,
-    PlacementFiles,
     PointCloud,
-    read_cloud,
+    Shown,
     read_image,
     read_session,
 )
+from scanloom.workflows.calibration_log import LogSettings, read_log
 from scanloom.workflows.configuration import Overrides
 
 log = logging.getLogger("scanloom.calibrate")
 _LEAST_CLOUDS = 4
 """Clouds from which a background can be told from the board."""
 _PROBED = 4
+_SETTINGS: dict[str, type[BaseModel]] = {
+    "calibrate": CalibrateSettings,
+    "cloud": CloudSettings,
+    "standstill": StandstillSettings,
+    "ingest": options.Settings,
+    "images": camera_options.Settings,
+}
+SettingsT = TypeVar("SettingsT", bound=BaseModel)
 
 
 @dataclass(frozen=True)
@@ -52,6 +64,7 @@ class Order:
     calibrate: CalibrateSettings = CalibrateSettings()
     cloud: CloudSettings = CloudSettings()
     pictures: bool = True
+    log: LogSettings = LogSettings()
 
 
 @dataclass(frozen=True)
@@ -115,25 +128,30 @@ def _three(values: F8, digits: int) -> str:
     return " ".join(f"{v:.{digits}f}" for v in values)
 
 
-def settings_of(overrides: Overrides) -> tuple[CalibrateSettings, CloudSettings]:
-    """Settings of `--set calibrate.field=value` and `--set cloud.field=value`.
+def order_of(
+    session: Path, out: Path, board: Path | None, overrides: Overrides, pictures: bool = True
+) -> Order:
+    """What is asked for, with settings as `--set calibrate.field=value`.
 
     Raises
     ------
     UsageError : an unknown name, or a value out of bounds.
     """
-    models: dict[str, type[BaseModel]] = {"calibrate": CalibrateSettings, "cloud": CloudSettings}
-    unknown = sorted(set(overrides) - set(models))
+    unknown = sorted(set(overrides) - set(_SETTINGS))
     if unknown:
-        raise UsageError(f"{unknown[0]!r} has no settings here", next_step="known are calibrate and cloud")
-    made = {name: _made(name, model, overrides.get(name, {})) for name, model in models.items()}
-    chosen, cloud = made["calibrate"], made["cloud"]
-    if not isinstance(chosen, CalibrateSettings) or not isinstance(cloud, CloudSettings):
-        raise TypeError("settings of another kind")
-    return chosen, cloud
+        raise UsageError(
+            f"{unknown[0]!r} has no settings here", next_step=f"known are {', '.join(_SETTINGS)}"
+        )
+
+    def made(model: type[SettingsT]) -> SettingsT:
+        name = next(name for name, other in _SETTINGS.items() if other is model)
+        return _made(name, model, overrides.get(name, {}))
+
+    log = LogSettings(made(options.Settings), made(camera_options.Settings), made(StandstillSettings))
+    return Order(session, out, board, made(CalibrateSettings), made(CloudSettings), pictures, log)
 
 
-def _made(name: str, model: type[BaseModel], values: dict[str, object]) -> BaseModel:
+def _made(name: str, model: type[SettingsT], values: dict[str, object]) -> SettingsT:
     try:
         return model.model_validate(values)
     except ValidationError as error:
@@ -144,6 +162,18 @@ def _made(name: str, model: type[BaseModel], values: dict[str, object]) -> BaseM
         ) from error
 
 
+def session_of(order: Order) -> CalibrationSession:
+    """A folder of placements, or a log.
+
+    Raises
+    ------
+    InvalidInput : it is neither.
+    """
+    if any((order.session / name).is_dir() for name in ("clouds", "images")):
+        return read_session(order.session, order.board)
+    return read_log(order.session, order.board, order.log)
+
+
 def calibrate_rig(order: Order) -> Outcome:
     """Look at every file, calibrate, check, and write.
 
@@ -151,7 +181,7 @@ def calibrate_rig(order: Order) -> Outcome:
     ------
     InvalidInput : the session cannot be calibrated; nothing was written then.
     """
-    session = read_session(order.session, order.board)
+    session = session_of(order)
     looked = look(session, order.cloud)
     given = {
         name: np.array(camera.T_lidar_camera)
@@ -183,16 +213,16 @@ def look(session: CalibrationSession, settings: CloudSettings) -> Looked:
     ------
     InvalidInput : an image is not its camera's, or no cloud or no image shows the board.
     """
-    images = {(p.name, c): _corners(session, p, c) for p in session.placements for c in p.images}
+    images = {(p.name, c): _corners(session, p, c) for p in session.placements for c in p.cameras}
     if not any(images.values()):
         raise _no_pattern(session)
-    clouds = {p.name: read_cloud(p.cloud) for p in session.placements}
+    clouds = {p.name: p.cloud() for p in session.placements}
     searches = search_clouds(clouds, session.board, settings)
     if not any(search.boards for search in searches.values()):
         raise _no_board(session, searches)
-    placements, unseen, boards = [], dict.fromkeys(session.unpaired, "it has no image, or no cloud"), {}
+    placements, unseen, boards = [], dict(session.unused), {}
     for p in session.placements:
-        seen = {c: found for c in p.images if (found := images[p.name, c]) is not None}
+        seen = {c: found for c in p.cameras if (found := images[p.name, c]) is not None}
         if not searches[p.name].boards:
             unseen[p.name] = "no board in the cloud" + _largest(searches[p.name])
         elif not seen:
@@ -225,13 +255,17 @@ def search_clouds(clouds: dict[str, PointCloud], board: Board, settings: CloudSe
     found = {}
     for i, (name, cloud) in enumerate(clouds.items()):
         log.info("cloud %d of %d: %s", i + 1, len(clouds), name)
-        found[name] = search_boards(cloud.points_m, cloud.intensity, cloud.ring, board, background, settings)
+        found[name] = _searched(cloud, board, background, settings)
     return found
 
 
-def _corners(session: CalibrationSession, p: PlacementFiles, camera: str) -> ImageBoard | None:
+def _searched(cloud: PointCloud, board: Board, background: F8 | None, settings: CloudSettings) -> Search:
+    return search_boards(cloud.points_m, cloud.intensity, cloud.ring, board, background, settings)
+
+
+def _corners(session: CalibrationSession, p: Shown, camera: str) -> ImageBoard | None:
     chosen = session.cameras[camera]
-    return find_corners(read_image(p.images[camera], chosen), session.board, chosen.model)
+    return find_corners(read_image(p, chosen), session.board, chosen.model)
 
 
 def _largest(search: Search) -> str:
@@ -243,8 +277,8 @@ def _no_pattern(session: CalibrationSession) -> InvalidInput:
     m, n = session.board.inner_corners
     seen: Counter[tuple[int, int]] = Counter()
     for p in session.placements[:_PROBED]:
-        for camera, path in p.images.items():
-            size = pattern_seen(read_image(path, session.cameras[camera]))
+        for camera in p.cameras:
+            size = pattern_seen(read_image(p, session.cameras[camera]))
             if size is not None:
                 seen[size] += 1
     what = f"No image shows a board of {m} x {n} inner corners"
@@ -257,7 +291,7 @@ def _no_pattern(session: CalibrationSession) -> InvalidInput:
         )
     return InvalidInput(
         f"{what}, nor any other.",
-        where=str(session.folder / "images"),
+        where=session.images,
         next_step="take images in which all squares of the board are seen, sharp and without glare",
     )
 
@@ -272,7 +306,7 @@ def _no_board(session: CalibrationSession, searches: dict[str, Search]) -> Inval
     )
     return InvalidInput(
         f"No cloud shows a board of {a} x {b} m{common}.",
-        where=str(session.folder / "clouds"),
+        where=session.clouds,
         next_step=f"see board_m in {session.board_file}, and that the board stands free, 1 to 6 m away, across several beams",
     )
 
@@ -284,7 +318,7 @@ def _explained(error: InvalidInput, session: CalibrationSession, looked: Looked)
     where = (
         str(session.board_file)
         if error.where == "board.yaml"
-        else f"{session.folder}, {error.where}".rstrip(", ")
+        else f"{session.path}, {error.where}".rstrip(", ")
     )
     return InvalidInput(what, where=where, next_step=error.next_step)
 
@@ -309,9 +343,7 @@ def _contents(
     return files
 
 
-def _pictures(
-    session: CalibrationSession, looked: Looked, found: Found, p: PlacementFiles
-) -> dict[str, bytes]:
+def _pictures(session: CalibrationSession, looked: Looked, found: Found, p: Shown) -> dict[str, bytes]:
     placement = next((q for q in found.everything.placements if q.name == p.name), None)
     if placement is None:
         return {}
@@ -326,7 +358,7 @@ def _pictures(
             else f"left out: {found.left_out.get(where, '')}"
         )
         made[f"pictures/{p.name}_{camera}.png"] = picture(
-            _colour(p.images[camera]),
+            _colour(p.image(camera)),
             cloud.points_m,
             cloud.intensity,
             found.estimate.T_lidar_camera[camera],
@@ -339,8 +371,8 @@ def _pictures(
     return made
 
 
-def _colour(path: Path) -> NDArray[np.uint8]:
+def _colour(data: bytes) -> NDArray[np.uint8]:
     from PIL import Image
 
-    with Image.open(path) as image:
+    with Image.open(io.BytesIO(data)) as image:
         return np.asarray(image.convert("RGB"))

@@ -1,9 +1,10 @@
-"""Reading a calibration session: a folder of clouds, images of the same names, camera files and the board."""
+"""A calibration session: boards shown in several places; here from a folder of clouds and images of the same names."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,34 +25,80 @@ _LAYOUT = (
 
 
 @dataclass(frozen=True)
-class PlacementFiles:
-    """Files of one placement."""
-
-    name: str
-    cloud: Path
-    images: dict[str, Path]
-
-
-@dataclass(frozen=True)
-class CalibrationSession:
-    """What a folder holds."""
-
-    folder: Path
-    board: Board
-    board_file: Path
-    cameras: dict[str, Camera]
-    placements: tuple[PlacementFiles, ...]
-    unpaired: tuple[str, ...]
-    """Names with a cloud and no image, or an image and no cloud."""
-
-
-@dataclass(frozen=True)
 class PointCloud:
-    """A cloud as the sensor gave it."""
+    """A cloud as the sensor gave it, or several that were taken of the same."""
 
     points_m: NDArray[np.float64]
     intensity: NDArray[np.float64]
     ring: NDArray[np.int64] | None
+    turn: NDArray[np.int64] | None = None
+    """(n,) which of several clouds a point is of; None where there is one."""
+
+
+class Shown(Protocol):
+    """One placement of the board."""
+
+    @property
+    def name(self) -> str:
+        """Unique in the session; usable as the name of a file."""
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Cameras with an image of it."""
+
+    def cloud(self) -> PointCloud:
+        """What the LiDAR measured. Raises InvalidInput when it cannot be read."""
+
+    def image(self, camera: str) -> bytes:
+        """An encoded image. Raises InvalidInput when it cannot be read."""
+
+    def where(self, camera: str) -> str:
+        """Where the image is, for messages."""
+
+
+@dataclass(frozen=True)
+class PlacementFiles:
+    """A placement in files."""
+
+    name: str
+    cloud_file: Path
+    images: dict[str, Path]
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        return tuple(self.images)
+
+    def cloud(self) -> PointCloud:
+        return read_cloud(self.cloud_file)
+
+    def image(self, camera: str) -> bytes:
+        try:
+            return self.images[camera].read_bytes()
+        except OSError as error:
+            raise InvalidInput(
+                f"The image cannot be read: {error.strerror}.", where=self.where(camera)
+            ) from error
+
+    def where(self, camera: str) -> str:
+        return str(self.images[camera])
+
+
+@dataclass(frozen=True)
+class CalibrationSession:
+    """A rig that was shown a board."""
+
+    path: Path
+    board: Board
+    board_file: Path
+    cameras: dict[str, Camera]
+    placements: tuple[Shown, ...]
+    unused: dict[str, str]
+    """Places that cannot be used, and why."""
+    images: str
+    """Where the images are, for messages."""
+    clouds: str
+    remarks: tuple[str, ...] = ()
+    """What was odd about it, in sentences."""
 
 
 def read_session(folder: Path, board: Path | None) -> CalibrationSession:
@@ -78,8 +125,11 @@ def read_session(folder: Path, board: Path | None) -> CalibrationSession:
             "No image has the name of a cloud.", where=str(folder),
             next_step="name cloud and image of a placement alike, as clouds/pose1.pcd and images/pose1.png",
         )  # fmt: skip
-    unpaired = tuple(sorted(set(clouds) ^ every, key=natural))
-    return CalibrationSession(folder, read_board(board_file), board_file, cameras, placements, unpaired)
+    lacking = dict.fromkeys(sorted(set(clouds) ^ every, key=natural), "it has no image, or no cloud")
+    return CalibrationSession(
+        folder, read_board(board_file), board_file, cameras, placements, lacking,
+        str(folder / "images"), str(folder / "clouds"),
+    )  # fmt: skip
 
 
 def _cameras(folder: Path) -> dict[str, Camera]:
@@ -162,27 +212,25 @@ def read_cloud(path: Path) -> PointCloud:
     return PointCloud(points[good], cloud.intensity[good].astype(np.float64), ring)
 
 
-def read_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
+def read_image(shown: Shown, camera: Camera) -> NDArray[np.uint8]:
     """A grey image (h, w) of the size the camera has.
 
     Raises
     ------
     InvalidInput : it is no image, or not that camera's.
     """
-    try:
-        image = grey(path.read_bytes())
-    except OSError as error:
-        raise InvalidInput(f"The image cannot be read: {error.strerror}.", where=str(path)) from error
+    image = grey(shown.image(camera.name))
+    where = shown.where(camera.name)
     if image is None:
         raise InvalidInput(
-            "This is no image.", where=str(path), next_step="replace it, or take the placement away"
+            "This is no image.", where=where, next_step="replace it, or take the placement away"
         )
     h, w = image.shape
     if (w, h) != (camera.model.width_px, camera.model.height_px):
         raise InvalidInput(
             f"The image has {w} x {h} pixels, camera {camera.name} has {camera.model.width_px} x {camera.model.height_px}: it "
             "is not this camera's, or was scaled or cut.",
-            where=str(path),
+            where=where,
             next_step="use the images as recorded, and the camera file of this camera",
         )
     return image

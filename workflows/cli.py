@@ -364,7 +364,8 @@ def calibrate_command(
     session: Annotated[
         Path,
         typer.Argument(
-            help="Folder with clouds/, images/, camera_info.yaml (or camera_info/) and board.yaml."
+            help="A log in which a board stands still in several places, or a folder with clouds/, images/, camera_info.yaml (or "
+            "camera_info/) and board.yaml."
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder of the calibration and its pictures.")],
@@ -380,14 +381,13 @@ def calibrate_command(
     as_json: JsonOption = False,
 ) -> None:
     """Cameras to a LiDAR from a chessboard shown in a few places."""
-    from scanloom.workflows.calibrate_rig import Order, calibrate_rig, settings_of, text_of
+    from scanloom.workflows.calibrate_rig import calibrate_rig, order_of, text_of
     from scanloom.workflows.configuration import command_line_settings
 
     overrides = command_line_settings(settings or [])
     if method is not None:
         overrides.setdefault("calibrate", {})["method"] = method.value
-    chosen, cloud = settings_of(overrides)
-    outcome = calibrate_rig(Order(session, out, board, chosen, cloud, pictures))
+    outcome = calibrate_rig(order_of(session, out, board, overrides, pictures))
     if as_json:
         _emit(outcome.as_json())
     else:

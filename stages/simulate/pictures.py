@@ -46,11 +46,12 @@ def camera_entries(settings: Settings, shots: Iterator[Shot]) -> Iterator[Entry]
         image = class_of(IMAGE)(header=head, format="jpeg", data=np.frombuffer(shot.jpeg, np.uint8))
         received = shot.end_ns + DELAY_NS
         yield received, image_topic(name), shot.stamp_ns, serialised(IMAGE, image)
-        info = _info(models[shot.camera], head)
+        info = lens_message(models[shot.camera], head)
         yield received, info_topic(name), shot.stamp_ns, serialised(INFO, info)
 
 
-def _info(lens: CameraModel, head: object) -> object:
+def lens_message(lens: CameraModel, head: object) -> object:
+    """The camera info of a lens."""
     K = np.array([lens.fx_px, 0.0, lens.cx_px, 0.0, lens.fy_px, lens.cy_px, 0.0, 0.0, 1.0])
     P = np.column_stack((K.reshape(3, 3), np.zeros(3))).ravel()
     region = class_of("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)

@@ -140,10 +140,11 @@ def entries(
 def _clouds(sweeps: Iterator[Sweep]) -> Iterator[Entry]:
     for sweep in sweeps:
         last_ns = sweep.start_ns + int(float(sweep.time_s[-1]) * 1e9 if len(sweep.time_s) else 0)
-        yield last_ns + DELAY_NS[LIDAR], LIDAR, sweep.start_ns, _serialise(LIDAR, _cloud_message(sweep))
+        yield last_ns + DELAY_NS[LIDAR], LIDAR, sweep.start_ns, _serialise(LIDAR, cloud_message(sweep))
 
 
-def _cloud_message(sweep: Sweep) -> Any:
+def cloud_message(sweep: Sweep) -> Any:
+    """A sweep as the LiDAR's driver sends it."""
     points = np.zeros(len(sweep.xyz), POINT)
     points["x"], points["y"], points["z"] = sweep.xyz.T
     points["intensity"], points["ring"], points["time"] = sweep.intensity, sweep.ring, sweep.time_s

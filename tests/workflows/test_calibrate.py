@@ -18,7 +18,7 @@ from scanloom.schemas.errors import EXIT_INVALID_INPUT, InvalidInput, UsageError
 from scanloom.schemas.metrics import kind_of
 from scanloom.stages.logs.camera_files import read_camera_file
 from scanloom.workflows import calibrate_rig as rig
-from scanloom.workflows.calibrate_rig import Looked, Order, calibrate_rig, settings_of, text_of
+from scanloom.workflows.calibrate_rig import Looked, Order, calibrate_rig, order_of, text_of
 from scanloom.workflows.calibration_folder import PointCloud, read_session
 from scanloom.workflows.cli import app
 
@@ -74,9 +74,8 @@ def seen_as(monkeypatch, scene):
 
 def test_everything_is_written(session, monkeypatch, tmp_path):
     seen_as(monkeypatch, session.scene)
-    chosen, cloud = settings_of({"calibrate": {"halves": 2}})
     out = tmp_path / "out"
-    outcome = calibrate_rig(Order(session.folder, out, None, chosen, cloud))
+    outcome = calibrate_rig(order_of(session.folder, out, None, {"calibrate": {"halves": 2}}))
     calibration = Calibration.open(out / "calibration.json")
     assert calibration == outcome.calibration
     assert [c.name for c in calibration.cameras] == ["cam0", "cam1", "cam2"]
@@ -146,12 +145,14 @@ def test_folders_that_lack_something(session, break_it, message):
 
 
 def test_settings():
-    chosen, cloud = settings_of({"calibrate": {"method": "paper"}, "cloud": {"max_range_m": 9.0}})
-    assert chosen.method == "paper" and cloud.max_range_m == 9.0
+    given = {"calibrate": {"method": "paper"}, "cloud": {"max_range_m": 9.0}, "standstill": {"scans": 3}}
+    order = order_of(Path("a"), Path("b"), None, given)
+    assert order.calibrate.method == "paper" and order.cloud.max_range_m == 9.0
+    assert order.log.standstill.scans == 3
     with pytest.raises(UsageError, match="odometry"):
-        settings_of({"odometry": {}})
+        order_of(Path("a"), Path("b"), None, {"odometry": {}})
     with pytest.raises(UsageError, match=r"calibrate\.halfs"):
-        settings_of({"calibrate": {"halfs": 2}})
+        order_of(Path("a"), Path("b"), None, {"calibrate": {"halfs": 2}})
 
 
 def test_command_line_fails_as_for_bad_input(session, tmp_path):

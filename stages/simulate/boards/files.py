@@ -30,7 +30,12 @@ def write_session(session: BoardSession, folder: Path, truth: Path | None = None
             image = session.image(camera.name, k)
             (folder / "images" / camera.name / f"{name}.png").write_bytes(png(image))
     if truth is not None:
-        truth.write_text(json.dumps(session.truth(), indent=1) + "\n")
+        write_truth(session, truth)
+
+
+def write_truth(session: BoardSession, path: Path) -> None:
+    """Cameras, boards and what is wrong, as JSON."""
+    path.write_text(json.dumps(session.truth(), indent=1) + "\n")
 
 
 def board_yaml(session: BoardSession) -> str:

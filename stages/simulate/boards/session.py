@@ -17,8 +17,8 @@ from scanloom.stages.simulate.boards.rig import told_camera, true_cameras
 from scanloom.stages.simulate.boards.room import Part, Scenery, board_parts, room
 from scanloom.stages.simulate.boards.scan import Cloud, Scanner
 from scanloom.stages.simulate.boards.settings import Bad, BoardSettings
-from scanloom.stages.simulate.boards.shots import shot
-from scanloom.stages.simulate.eye import Eye
+from scanloom.stages.simulate.boards.shots import radiance_of, taken
+from scanloom.stages.simulate.eye import F4, Eye
 from scanloom.stages.simulate.sweeping import scene_of
 
 _FACING = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -26,6 +26,8 @@ _FACING = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _TRIES = 300
 _MOVED = (np.radians(4.0), 0.06)
 """By how much a board moves when it moves: rad and m, standard deviation of each axis."""
+_SMEAR = 3.0
+"""How much wider points become in the image of a board that moves."""
 _SPREAD_DEG = 22.0
 """How far beside the middle of a camera's view the board is shown."""
 
@@ -66,9 +68,12 @@ class BoardSession:
     def cloud(self, k: int) -> Cloud:
         """What the LiDAR measured at placement `k`; the same every time."""
         stand = self.stands[k]
-        scene, scenery = self._scene(k, stand.T_lidar_board)
-        rng = np.random.default_rng((self.seed, 72, k))
-        return self.scanner.scan(self.settings, scene, scenery, stand.board, stand.T_lidar_board, rng)
+        return self.cloud_at(k, stand.T_lidar_board, np.random.default_rng((self.seed, 72, k)))
+
+    def cloud_at(self, k: int, T_lidar_board: F8, rng: np.random.Generator) -> Cloud:
+        """The same with the board of placement `k` somewhere else."""
+        scene, scenery = self._scene(k, T_lidar_board)
+        return self.scanner.scan(self.settings, scene, scenery, self.stands[k].board, T_lidar_board, rng)
 
     @cached_property
     def clouds(self) -> tuple[Cloud, ...]:
@@ -77,19 +82,34 @@ class BoardSession:
 
     def image(self, camera: str, k: int) -> NDArray[np.uint8]:
         """Image (h, w, 3), red green blue, of a camera at placement `k`; a second or two each."""
-        source = self._source(camera)
-        index = self._index(source)
         stand = self.stands[k]
-        rng = np.random.default_rng((self.seed, 73, k, index))
-        eye = self._eyes.setdefault(source, Eye(self.cameras[index].model))
-        scene, scenery = self._scene(k, stand.T_lidar_seen)
-        T = np.array(self.cameras[index].T_lidar_camera)
-        glare = None
-        if stand.bad == "glare":
-            spot = rng.uniform(-0.25, 0.25, 2) * np.asarray(stand.board.board_m)
-            glare = np.append(spot, rng.uniform(0.08, 0.14))
-        blur = self.settings.blur_px * (3.0 if stand.bad == "moved" else 1.0)
-        return shot(eye, T, scene, scenery, self._lamps, stand.board, stand.T_lidar_seen, glare, blur, rng)
+        rng = np.random.default_rng((self.seed, 73, k, self._index(self._source(camera))))
+        glare = self._glare(k, rng)
+        blur = self.settings.blur_px * (_SMEAR if stand.bad == "moved" else 1.0)
+        return taken(self.light(camera, k, stand.T_lidar_seen, glare), self._eye(camera), blur, rng)
+
+    def light(self, camera: str, k: int, T_lidar_board: F8, glare: F8 | None = None) -> F4:
+        """Light (h, w, 3) in a camera with the board of placement `k` anywhere."""
+        scene, scenery = self._scene(k, T_lidar_board)
+        T = np.array(self.cameras[self._index(self._source(camera))].T_lidar_camera)
+        board = self.stands[k].board
+        return radiance_of(self._eye(camera), T, scene, scenery, self._lamps, board, T_lidar_board, glare)
+
+    def image_of(self, light: F4, camera: str, moving: bool, rng: np.random.Generator) -> NDArray[np.uint8]:
+        """An image of `light`; one of a board that moves is smeared."""
+        return taken(light, self._eye(camera), self.settings.blur_px * (_SMEAR if moving else 1.0), rng)
+
+    def _eye(self, camera: str) -> Eye:
+        source = self._source(camera)
+        return self._eyes.setdefault(source, Eye(self.cameras[self._index(source)].model))
+
+    def _glare(self, k: int, rng: np.random.Generator) -> F8 | None:
+        """Where on the board a lamp is mirrored, and how large it is."""
+        stand = self.stands[k]
+        if stand.bad != "glare":
+            return None
+        spot = rng.uniform(-0.25, 0.25, 2) * np.asarray(stand.board.board_m)
+        return np.append(spot, rng.uniform(0.08, 0.14))
 
     def true_corners(self, camera: str, k: int) -> tuple[F8, NDArray[np.bool_]]:
         """Pixels (n, 2) of the corners in an image and which of them it holds (n,), in the order of the board's corners;
@@ -104,8 +124,8 @@ class BoardSession:
         A board that is partly out of the image, is mirrored over or is another one is not found.
         """
         stand = self.stands[k]
-        pixels, seen = self.true_corners(camera, k)
-        if not seen.all() or stand.bad in ("glare", "wrong board"):
+        pixels, there = self.true_corners(camera, k)
+        if not there.all() or stand.bad in ("glare", "wrong board"):
             return None
         rng = np.random.default_rng((self.seed, 74, k, self._index(camera)))
         noise = self.settings.corner_noise_px * (3.0 if stand.bad == "moved" else 1.0)

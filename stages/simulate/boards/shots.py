@@ -19,11 +19,11 @@ _GREY = 0.24
 """Brightness that the exposure brings the image's mean to."""
 
 
-def shot(
-    eye: Eye, T_lidar_camera: F8, scene: Any, scenery: Scenery, lamps: F8, board: Print, T_lidar_board: F8,
-    glare: F8 | None, blur_px: float, rng: np.random.Generator,
-) -> NDArray[np.uint8]:  # fmt: skip
-    """One image (h, w, 3), red green blue; `glare` is where on the board a lamp is mirrored, if anywhere."""
+def radiance_of(
+    eye: Eye, T_lidar_camera: F8, scene: Any, scenery: Scenery, lamps: F8, board: Print, T_lidar_board: F8, glare: F8 | None
+) -> F4:  # fmt: skip
+    """Light (h, w, 3), red green blue, that falls on the sensor; `glare` is where on the board a lamp is mirrored, if
+    anywhere."""
     R, place = T_lidar_camera[:3, :3], T_lidar_camera[:3, 3]
     T_board_lidar = inverse(T_lidar_board)
 
@@ -43,7 +43,11 @@ def shot(
         colour[~hit.found | ~directions.any(axis=1)] = 0.0
         return colour.astype(np.float32), hit.triangle
 
-    radiance = picture(eye, look, _PLACES, _CONTRAST)
+    return picture(eye, look, _PLACES, _CONTRAST)
+
+
+def taken(radiance: F4, eye: Eye, blur_px: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """An image (h, w, 3) of light, with an exposure that is a little off and noise."""
     brightness = np.minimum(radiance.mean(axis=2), 1.0)
     exposure = _GREY / max(float(brightness.mean()), 1e-3) * float(np.exp(0.15 * rng.standard_normal()))
     return develop(radiance, exposure, eye.model, Film(blur_px=blur_px), rng)
