@@ -25,8 +25,13 @@ from scanloom.stages.report.raster import View, draw_map, fit_view
 VERSION = 1
 
 PREVIEW, OVERLAY, LEFT_OUT, VIEW = "preview.png", "overlay.svg", "left_out.png", "view.json"
-LAYERS = {"height": "height.webp", "intensity": "intensity.webp", "classes": "classes.webp"}
-"""The map alone, coloured by what the key says."""
+LAYERS = {
+    "height": "height.webp",
+    "intensity": "intensity.webp",
+    "classes": "classes.webp",
+    "colour": "colour.webp",
+}
+"""The map alone, coloured by what the key says; `colour` only where cameras saw it."""
 _QUALITY = 72
 
 
@@ -61,6 +66,8 @@ def picture(
         "intensity": _enlarge(drawn.intensity, view, Image.Resampling.BICUBIC),
         "classes": _enlarge(drawn.classes, view, Image.Resampling.NEAREST),
     }
+    if drawn.colour is not None:
+        layers["colour"] = _enlarge(drawn.colour, view, Image.Resampling.BICUBIC)
     marks: list[Mark] = map_marks(view, paths, loops, graph) + scale_bar(view)
     return PictureFiles(
         contents={

@@ -1,4 +1,5 @@
-"""The map from above: points splatted into pixels, coloured by height, intensity or class, shaded by depth."""
+"""The map from above: points splatted into pixels, coloured by height, intensity, class or what cameras saw, shaded by
+depth."""
 
 from __future__ import annotations
 
@@ -25,6 +26,8 @@ _GREYS = np.array([[30, 34, 42], [128, 132, 138], [250, 250, 246]], float)
 _GAMMA = 0.65
 """Below one lifts the dark ground, of which most of a map is."""
 CLASS_COLOURS = {PointClass.GROUND: (138, 122, 100), PointClass.STATIC: (92, 164, 208)}
+_UNSEEN = (44, 48, 54)
+"""Of what no camera saw."""
 _OTHER_COLOUR = (200, 120, 200)
 """Of classes that a map does not usually hold."""
 
@@ -67,11 +70,12 @@ def fit_view(low_m: Any, high_m: Any, margin_m: float, longest: int, finest_m: f
 
 @dataclass(frozen=True)
 class Drawn:
-    """The same view three times, RGB (height, width, 3)."""
+    """The same view three times, RGB (height, width, 3), and once more where cameras saw the map."""
 
     height: NDArray[np.uint8]
     intensity: NDArray[np.uint8]
     classes: NDArray[np.uint8]
+    colour: NDArray[np.uint8] | None = None
 
 
 def draw_map(tiles: Iterable[Tile], view: View) -> Drawn:
@@ -84,12 +88,26 @@ def draw_map(tiles: Iterable[Tile], view: View) -> Drawn:
     step = max(round(cell / view.pixel_m), 1)
     cells = (view.height // step + 1, view.width // step + 1)
     low, soil = np.full(cells, np.inf, np.float32), np.zeros((*cells, 2))
+    seen, tint = np.full(shape, -np.inf, np.float32), np.zeros((*shape, 3), np.uint8)
     for tile in tiles:
         left, bottom = tile.offset_m[0] - view.left_m, tile.offset_m[1] - view.bottom_m
         _splat(
             tile.x_m, tile.y_m, tile.z_m, tile.offset_m[2], tile.intensity, tile.class_, int(PointClass.GROUND),
             left, bottom, view.pixel_m, step, top, bright, glow, kind, low, soil,
         )  # fmt: skip
+        _splat_colour(
+            tile.x_m,
+            tile.y_m,
+            tile.z_m,
+            tile.offset_m[2],
+            tile.colour,
+            tile.views,
+            left,
+            bottom,
+            view.pixel_m,
+            seen,
+            tint,
+        )
     filled = np.isfinite(top)
     if not filled.any():
         return Drawn(*(np.full((*shape, 3), BACKGROUND, np.uint8) for _ in range(3)))
@@ -101,6 +119,7 @@ def draw_map(tiles: Iterable[Tile], view: View) -> Drawn:
         _shade(top, above, _stretch(bright, filled), light),
         _in_greys(np.where((above < _GROUND_M) & (bright > 0), bright, glow), filled, light),
         _in_classes(kind, filled, light),
+        _in_colour(seen, tint, filled, light),
     )
 
 
@@ -124,6 +143,20 @@ def _in_classes(
         colours[int(class_)] = colour
     shaded = colours[kind] * light[..., None]
     return np.where(filled[..., None], shaded, np.array(BACKGROUND)).astype(np.uint8)
+
+
+def _in_colour(
+    seen: NDArray[np.float32],
+    tint: NDArray[np.uint8],
+    filled: NDArray[np.bool_],
+    light: NDArray[np.float32],
+) -> NDArray[np.uint8] | None:
+    """What cameras saw, dark grey where they saw nothing; None where they saw nothing at all."""
+    known = np.isfinite(seen)
+    if not known.any():
+        return None
+    colour = np.where(known[..., None], tint, np.array(_UNSEEN)) * (0.5 + 0.5 * light)[..., None]
+    return np.where((filled | known)[..., None], colour, np.array(BACKGROUND)).astype(np.uint8)
 
 
 def _ground(
@@ -210,6 +243,26 @@ def _splat(
             soil[py // step, px // step, 1] += 1.0
         if z < low[py // step, px // step]:
             low[py // step, px // step] = z
+
+
+@kernel
+def _splat_colour(
+    xs: NDArray[np.float32], ys: NDArray[np.float32], zs: NDArray[np.float32], z0: float, colour: NDArray[np.uint8],
+    views: NDArray[np.uint16], left: float, bottom: float, pixel_m: float, seen: NDArray[np.float32],
+    tint: NDArray[np.uint8],
+) -> None:  # fmt: skip
+    """Keep per pixel the highest point that has a colour: cameras on the road see few roofs."""
+    height, width = seen.shape
+    for i in range(len(xs)):
+        px = np.int64(np.floor((xs[i] + left) / pixel_m))
+        py = height - 1 - np.int64(np.floor((ys[i] + bottom) / pixel_m))
+        if views[i] == 0 or px < 0 or px >= width or py < 0 or py >= height:
+            continue
+        z = zs[i] + z0
+        if z > seen[py, px]:
+            seen[py, px] = z
+            for c in range(3):
+                tint[py, px, c] = colour[i, c]
 
 
 @kernel

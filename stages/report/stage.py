@@ -1,7 +1,7 @@
 """Report: the parts of `report.html` that do not vary from run to run.
 
 A verdict in a sentence with every check behind it; the input and what is odd about it; the map from above by height,
-intensity or class, with what was left out of it to be shown or hidden; the tracks coloured by what is known of each scan;
+intensity, class or colour, with what was left out of it to be shown or hidden; the tracks coloured by what is known of each scan;
 errors along the way; where odometry was blind, and in which direction; GNSS residuals by verdict; loops with what was
 refused and why; what moved and how much of each scan was left out; for an extended map what is no longer there; the pose
 graph kind by kind; all figures; the tiles.
@@ -138,7 +138,11 @@ def report(
 def _pictures(picture: PictureFiles) -> dict[str, Any]:
     """The map's pictures as they stand in the page."""
     return {
-        "layers": {name: _data_uri(picture.read(file), "webp") for name, file in LAYERS.items()},
+        "layers": {
+            name: _data_uri(picture.read(file), "webp")
+            for name, file in LAYERS.items()
+            if file in picture.names or file in picture.contents
+        },
         "left_out": _data_uri(picture.read(LEFT_OUT), "png"),
         "overlay": picture.read(OVERLAY).decode(),
         "view": json.loads(picture.read(VIEW)),

@@ -12,7 +12,7 @@ from scanloom.stages.report.figures import number
 from scanloom.stages.report.overlay import SESSION_COLOURS
 
 FOLDER = Path(__file__).parent
-LAYER_WORDS = {"height": "height", "intensity": "intensity", "classes": "class"}
+LAYER_WORDS = {"height": "height", "intensity": "intensity", "classes": "class", "colour": "colour"}
 """What the pictures of the map are called."""
 
 

@@ -196,3 +196,18 @@ def test_a_map_without_points_is_dark_in_all_three() -> None:
     drawn = draw_map([], View(0.0, 0.0, 20, 16, 0.5))
     for picture in (drawn.height, drawn.intensity, drawn.classes):
         assert (picture == np.array(BACKGROUND)).all()
+
+
+def test_the_picture_in_colour_shows_what_cameras_saw() -> None:
+    places = np.array([[5.2, 5.2, 0.0], [5.2, 5.2, 4.0], [15.2, 5.2, 0.0]])
+    blind = tile_of(places)
+    assert draw_map([blind], View(0.0, 0.0, 40, 20, 0.5)).colour is None
+    tile = tile_of(places)
+    tile.colour[tile.z_m < 1], tile.views[tile.z_m < 1] = (200, 10, 60), 1
+    tile.colour[tile.x_m > 9], tile.views[tile.x_m > 9] = 0, 0
+    drawn = draw_map([tile], View(0.0, 0.0, 40, 20, 0.5)).colour
+    assert drawn is not None
+    # What stands over it was seen by none and does not hide it.
+    red, green, blue = drawn[9, 10].tolist()
+    assert red > 90 and red > 10 * green and 2.5 < red / blue < 4.5
+    assert max(drawn[9, 30]) < 70 and tuple(drawn[0, 0]) == BACKGROUND
