@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scanloom.stages.calibrate.cloud.pose import SENSOR_SIGMA_M
+from scanloom.stages.calibrate.cloud.misfit import SENSOR_SIGMA_M
 from scanloom.stages.geometry.se3 import F8
 
 
