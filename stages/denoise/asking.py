@@ -28,7 +28,6 @@ SAME_M, SAME_PER_M, BEYOND_M, BEYOND_PER_M = (np.float32(c) for c in (0.2, 0.01,
 """A neighbouring scan meets a point again within the first pair; what it sees behind it is farther by the second."""
 WHOLE = np.uint64
 """Of cells that are looked up: a signed number is asked each time whether it counts from the end."""
-ZERO = np.float32(0.0)
 
 
 def answers(moment: Moment, offsets: tuple[int, ...], asked: I8) -> U1:
@@ -77,7 +76,7 @@ def _ask(
             for j in range(WHOLE(3)):
                 range_m = ranges[first + i * step + j]
                 met += abs(range_m - r) < same
-                behind += (range_m == ZERO) | (range_m > beyond)
+                behind += range_m > beyond
         votes[m, 0] += met > 0
         votes[m, 1] += behind >= LOOKED_THROUGH
 

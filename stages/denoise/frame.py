@@ -21,7 +21,7 @@ I8 = NDArray[np.int64]
 BESIDE = 4
 """Columns that are repeated at either end."""
 FIRST = np.int32(0)
-NO_RANGE = np.float32(np.nan)
+ZERO, ENDLESS, NO_RANGE = np.float32(0.0), np.float32(np.inf), np.float32(np.nan)
 """Of the rows above and below: any comparison with it fails."""
 
 
@@ -30,7 +30,7 @@ class Frame:
     """Cells of a range image in a row; `stride` of them to the next row."""
 
     range_m: F4
-    """Of each cell; 0 where there is nothing, NaN above and below the image."""
+    """Of each cell; inf where there is nothing, NaN above and below the image."""
     point: I4
     """Number of each cell's point; -1 where there is none."""
     row_start: I4
@@ -61,13 +61,13 @@ def _framed(range_m: F4, point: I4) -> tuple[F4, I4]:
     ranges = np.full((rows + 2, columns + 2 * BESIDE), NO_RANGE, np.float32)
     points = np.full(ranges.shape, -1, np.int32)
     for v in range(rows):
-        ranges[v + 1, BESIDE : BESIDE + columns], points[v + 1, BESIDE : BESIDE + columns] = (
-            range_m[v],
-            point[v],
-        )
+        row = ranges[v + 1, BESIDE : BESIDE + columns]
+        for u in range(columns):
+            row[u] = range_m[v, u] if range_m[v, u] > ZERO else ENDLESS
+        points[v + 1, BESIDE : BESIDE + columns] = point[v]
         for k in range(BESIDE):
             before, after = columns - BESIDE + k, BESIDE + columns + k
-            ranges[v + 1, k], ranges[v + 1, after] = range_m[v, before], range_m[v, k]
+            ranges[v + 1, k], ranges[v + 1, after] = row[before], row[k]
             points[v + 1, k], points[v + 1, after] = point[v, before], point[v, k]
     return ranges.ravel(), points.ravel()
 

@@ -28,7 +28,9 @@ NOISE_M, NOISE_PER_M, NEAR_M, NEAR_PER_M = (np.float32(c) for c in (0.05, 0.005,
 """A point lies on a line if it is off it by less than the noise; neighbours within the second pair are near."""
 ASIDE = 2
 """Columns to each side that are looked at, of the row itself and of those above and below."""
-ZERO, ONE, TWICE, FOUR, EIGHT, UNBENT = (np.float32(c) for c in (0.0, 1.0, 2.0, 4.0, 8.0, 1e9))
+ZERO, ONE, TWICE, FOUR, EIGHT, UNBENT, ENDLESS = (
+    np.float32(c) for c in (0.0, 1.0, 2.0, 4.0, 8.0, 1e9, np.inf)
+)
 WHOLE = np.uint64
 
 
@@ -114,7 +116,7 @@ def _shape(
 @kernel
 def _near(a: float, r: float, near: Float) -> float:
     """One if there is something at about this range."""
-    return ONE if (a > ZERO) & (abs(a - r) < near) else ZERO  # type: ignore[return-value]
+    return ONE if abs(a - r) < near else ZERO  # type: ignore[return-value]
 
 
 @kernel
@@ -122,4 +124,4 @@ def bend(a: float, b: float, r: float) -> float:
     """How far range `r` is off the line between its neighbours `a` and `b`: planes are straight in 1 / range."""
     both = a * b
     off = abs(TWICE * both / (a + b) - r)  # before it is asked whether there are two: so it is no branch
-    return off if both > ZERO else UNBENT  # type: ignore[return-value]
+    return off if both < ENDLESS else UNBENT  # type: ignore[return-value]
