@@ -35,7 +35,8 @@ def test_neighbours_are_those_of_the_image(points: int) -> None:
             k = frame.place[drawn] + i * frame.stride + j
             inside = (v + i >= 0) & (v + i < rows)
             there = np.clip(v + i, 0, rows - 1), (u + j) % columns
-            np.testing.assert_array_equal(frame.range_m[k], np.where(inside, image.range_m[there], np.nan))
+            seen = np.where(image.point[there] >= 0, image.range_m[there], np.inf)
+            np.testing.assert_array_equal(frame.range_m[k], np.where(inside, seen, np.nan))
             np.testing.assert_array_equal(frame.point[k], np.where(inside, image.point[there], -1))
     r = np.sqrt(x[drawn] ** 2 + y[drawn] ** 2 + z[drawn] ** 2)
     np.testing.assert_allclose(frame.away_m[drawn], r, rtol=1e-6)

@@ -37,11 +37,11 @@ def street(seed: int) -> Frame:
 def alone(frame: Frame, k: int, r: float) -> int:
     """Shape of a point at range r in cell k."""
     around = [frame.range_m[k + i * frame.stride + j] for i in (-1, 0, 1) for j in range(-2, 3)]
-    near = sum(bool(a > 0 and abs(a - r) < max(0.3, 0.02 * r)) for a in around) - 1
+    near = sum(bool(abs(a - r) < max(0.3, 0.02 * r)) for a in around) - 1
     noise, offs = 0.05 + 0.005 * r, []
     for d in (1, 2, frame.stride - 1, frame.stride, frame.stride + 1):
         a, b = float(frame.range_m[k + d]), float(frame.range_m[k - d])
-        offs.append(abs(2 * a * b / (a + b) - r) if a * b > 0 else np.inf)
+        offs.append(abs(2 * a * b / (a + b) - r) if a * b < np.inf else np.inf)
     straight = sum(off < noise for off in offs)
     lines = 1 + min(straight, 4) if min(offs) < 5.0 * noise else 0
     shape = lines * COUNTS + sum(near >= edge for edge in (1, 2, 4, 8))
