@@ -54,7 +54,8 @@ class Piece(Table):
 
 @dataclass(frozen=True)
 class Paint(Table):
-    """What the images of one stretch add to the colour of one tile. One part per tile; rows are ordered by `voxel`.
+    """What the images of one stretch add to the colour of one tile, in a brightness of its own. One part per tile; rows are
+    ordered by `voxel`.
 
     Sums are whole numbers, so that they do not depend on the order in which they are added.
     """
@@ -71,6 +72,13 @@ class Paint(Table):
         "i8", "sum of weight times linear red, green, blue, in steps of 2^-24", shape=(3,)
     )
     views: NDArray[np.int32] = column("i4", "images that saw the voxel")
+
+
+@dataclass(frozen=True)
+class Colours(Paint):
+    """The colours that all images of a session give one tile, in one brightness. One part per tile; rows are ordered by `voxel`."""
+
+    NAME: ClassVar[str] = "colours"
 
 
 @dataclass(frozen=True)

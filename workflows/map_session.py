@@ -14,7 +14,17 @@ from scanloom.schemas.pose_graph import Graph
 from scanloom.schemas.rig import SensorCheck
 from scanloom.schemas.scans import Deskewed, Labels, Scans
 from scanloom.schemas.session import RawLog, Session, TruthLog
-from scanloom.schemas.tiles import MapFiles, Overview, Paint, Piece, RemovedTile, Tile, TileFiles, TileIndex
+from scanloom.schemas.tiles import (
+    Colours,
+    MapFiles,
+    Overview,
+    Paint,
+    Piece,
+    RemovedTile,
+    Tile,
+    TileFiles,
+    TileIndex,
+)
 from scanloom.schemas.tracks import Gnss, Imu, Wheel
 from scanloom.schemas.trajectory import Odometry, Poses, Truth
 from scanloom.schemas.windows import Track, TrackEnds, Window
@@ -22,7 +32,7 @@ from scanloom.stages.base import base
 from scanloom.stages.camera_check import camera_check
 from scanloom.stages.changes import changes
 from scanloom.stages.clean import clean, rays, relabel
-from scanloom.stages.colour import colour
+from scanloom.stages.colour import brightness, colour
 from scanloom.stages.denoise import denoise
 from scanloom.stages.deskew import deskew
 from scanloom.stages.evaluation import evaluation
@@ -67,8 +77,9 @@ NODES: tuple[Node, ...] = (
     node("relabel",    relabel,    per="chunk",   reads=(Deskewed, Labels, ObjectTracks, Cleared, Poses), writes=(FinalLabels, ClassCounts)),
     node("tiling",     tiling,     per="chunk",   reads=(Deskewed, FinalLabels, Poses),        writes=Piece),
     node("colour",     colour,     per="footage", reads=(Images, Cameras, Poses, ObjectTracks, Piece), writes=Paint),
+    node("brightness", brightness, per="session", reads=(Paint,),                              writes=Colours),
     node("changes",    changes,    per="map",     reads=(Base, Poses, Deskewed, FinalLabels, Piece), writes=(Changes, ChangeFiles)),
-    node("tiles",      tiles,      per="tile",    reads=(Piece, Paint),                        writes=(Tile, RemovedTile, TileFiles)),
+    node("tiles",      tiles,      per="tile",    reads=(Piece, Colours),                        writes=(Tile, RemovedTile, TileFiles)),
     node("overview",   overview,   per="map",     reads=(Tile, RemovedTile),                   writes=(TileIndex, Overview, MapFiles)),
     node("evaluation", evaluation, per="map",     reads=(Session, Truth, Odometry, Poses, Loops, Graph, Gnss, Tile, SensorCheck, ClassCounts, RemovedTile, CameraCheck), writes=(Metrics, ErrorTrack)),
     node("picture",    picture,    per="map",     reads=(Poses, Loops, Graph, TileIndex, Tile, RemovedTile), writes=PictureFiles),

@@ -30,15 +30,3 @@ def sampled(image: U1, pixels: F8) -> tuple[F8, NDArray[np.uint8], NDArray[np.ui
             light += LINEAR[value] / 9.0
             low, high = np.minimum(low, value.max(axis=1)), np.maximum(high, value.max(axis=1))
     return light, low, high
-
-
-def gain(light: F8, before: F8, least: int) -> float | None:
-    """What an image is to be multiplied with so that it agrees with light seen before (n, 3); None for too few points.
-
-    The median of the ratios of luminance: what moved, or was in the shade, is outvoted.
-    """
-    now, then = light @ LUMINANCE, before @ LUMINANCE
-    good = (now > 1e-4) & (then > 1e-4)
-    if int(good.sum()) < least:
-        return None
-    return float(np.exp(np.median(np.log(then[good] / now[good]))))

@@ -27,6 +27,10 @@ class Ground:
     normal: NDArray[np.float32]
     """(n, 3) unit normals; zeros where there is no surface."""
 
+    def near(self, place: F8, reach_m: float) -> NDArray[np.int64]:
+        """Rows of the points within a distance of a place (3,)."""
+        return np.flatnonzero(((self.points - place) ** 2).sum(axis=1) < reach_m**2)
+
 
 class Surroundings:
     """Tiles of a session, read when they are asked for."""

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scanloom.schemas.errors import StageError
 from scanloom.schemas.product import Parts, column, columns_of
 from scanloom.schemas.scans import PointClass
-from scanloom.schemas.tiles import LEFT_OUT, RANK_SHIFT, Paint, Piece, RemovedTile, Tile, TileFiles
+from scanloom.schemas.tiles import LEFT_OUT, RANK_SHIFT, Colours, Piece, RemovedTile, Tile, TileFiles
 from scanloom.stages.geometry import ply
 from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.normals import normals
@@ -51,7 +51,7 @@ class Met(Piece):
 
 
 def tiles(
-    settings: Settings, pieces: Parts[Piece], paints: Parts[Paint] | None = None
+    settings: Settings, pieces: Parts[Piece], colours: Parts[Colours] | None = None
 ) -> tuple[Tile, RemovedTile, TileFiles]:
     """Merge the pieces of one tile: the mean point, mean intensity and majority class of every voxel, its normal, when
     and by whom it was met; then order the points by level of detail.
@@ -68,7 +68,7 @@ def tiles(
     first_out = int(np.searchsorted(merged.voxel, 1 << RANK_SHIFT))
     of_map, left_out = merged.take(slice(0, first_out)), merged.take(slice(first_out, None))
     kept = of_map.take((of_map.count >= settings.min_points) & (of_map.scan_count >= settings.min_scans))
-    colour = coloured(kept.voxel, paints or ())
+    colour = coloured(kept.voxel, colours or ())
     tile = _ordered(Tile(**_average(kept, name, sessions), **colour, class_=_scenery(kept)))
     removed = _ordered(
         RemovedTile(

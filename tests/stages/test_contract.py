@@ -32,6 +32,7 @@ CONTENT_WITH_NOTHING = {
     "images",
     "camera_check",
     "colour",
+    "brightness",
     "truth",
     "overview",
     "tiles",

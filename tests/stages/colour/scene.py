@@ -14,7 +14,8 @@ from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import Deskewed, DeskewedScan, PointClass, ScanLabels
 from scanloom.schemas.tiles import Paint, Piece, Tile
 from scanloom.schemas.trajectory import Poses
-from scanloom.stages.colour import Settings, colour
+from scanloom.stages.colour import Settings, brightness, colour
+from scanloom.stages.colour.brightness import Settings as Brightness
 from scanloom.stages.geometry.camera import rays
 from scanloom.stages.geometry.se3 import F8, pose
 from scanloom.stages.geometry.srgb import srgb
@@ -89,7 +90,7 @@ def painted(
     return [(part.key, part.product) for part in made]
 
 
-def tile(paints: Sequence[tuple[str, Paint]]) -> Tile:
+def tile(paints: Sequence[tuple[str, Paint]], **settings: float) -> Tile:
     """The one tile of the scene."""
     keyed = Parts(
         [
@@ -97,4 +98,8 @@ def tile(paints: Sequence[tuple[str, Paint]]) -> Tile:
             for n, (key, paint) in enumerate(paints)
         ]
     )
-    return tiles(TilesSettings(), pieces(), keyed)[0]
+    colours = [
+        ((("session", "a"), ("tile", part.key)), part.product)
+        for part in brightness(Brightness(**settings), keyed)
+    ]
+    return tiles(TilesSettings(), pieces(), Parts(colours))[0]

@@ -9,7 +9,6 @@ import pytest
 
 from scanloom.schemas.objects import ObjectTracks
 from scanloom.schemas.tiles import Tile
-from scanloom.stages.colour.light import gain
 from scanloom.stages.geometry import ply
 from scanloom.stages.geometry.se3 import pose
 from scanloom.stages.geometry.srgb import LINEAR, srgb
@@ -47,7 +46,7 @@ def groups(made: Tile) -> dict[str, np.ndarray]:
 
 
 def test_points_get_the_colour_of_what_the_camera_saw() -> None:
-    made = tile(painted([image(picture())], path(1), grey=0.1))
+    made = tile(painted([image(picture())], path(1)), grey=0.1)
     rows = groups(made)
     mean = {name: LINEAR[made.colour[rows[name]]].mean(axis=0) for name in ("box", "left", "right")}
     for name, light in (("box", BOX), ("left", LEFT), ("right", RIGHT)):
@@ -128,14 +127,6 @@ def test_far_and_near_points_get_no_colour_from_an_image() -> None:
         .views[groups(tile([]))["box"]]
         .any()
     )
-
-
-def test_gain_is_the_median_and_needs_enough_points() -> None:
-    before = np.full((300, 3), 0.2)
-    now = before * 0.5
-    now[:100] = 0.9
-    assert gain(now, before, 300) == pytest.approx(2.0)
-    assert gain(now[:299], before[:299], 300) is None
 
 
 def test_values_of_srgb_come_back() -> None:
