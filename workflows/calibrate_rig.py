@@ -255,12 +255,8 @@ def search_clouds(clouds: dict[str, PointCloud], board: Board, settings: CloudSe
     found = {}
     for i, (name, cloud) in enumerate(clouds.items()):
         log.info("cloud %d of %d: %s", i + 1, len(clouds), name)
-        found[name] = _searched(cloud, board, background, settings)
+        found[name] = search_boards(cloud.points_m, cloud.intensity, cloud.ring, board, background, settings)
     return found
-
-
-def _searched(cloud: PointCloud, board: Board, background: F8 | None, settings: CloudSettings) -> Search:
-    return search_boards(cloud.points_m, cloud.intensity, cloud.ring, board, background, settings)
 
 
 def _corners(session: CalibrationSession, p: Shown, camera: str) -> ImageBoard | None:

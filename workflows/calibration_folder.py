@@ -31,8 +31,6 @@ class PointCloud:
     points_m: NDArray[np.float64]
     intensity: NDArray[np.float64]
     ring: NDArray[np.int64] | None
-    turn: NDArray[np.int64] | None = None
-    """(n,) which of several clouds a point is of; None where there is one."""
 
 
 class Shown(Protocol):

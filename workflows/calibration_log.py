@@ -287,7 +287,6 @@ class _Place:
             points,
             np.concatenate([s.intensity for s in scans]).astype(np.float64),
             ring if len(np.unique(ring)) > 1 else None,
-            np.repeat(np.arange(len(scans)), [len(s) for s in scans]),
         )
 
     def encoded(self) -> dict[str, bytes]:

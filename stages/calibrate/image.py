@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from scanloom.schemas.cameras import CameraModel
 from scanloom.stages.calibrate.board import Board, Charuco
+from scanloom.stages.calibrate.grid import pattern_in
 from scanloom.stages.calibrate.rays import Bearings, board_pose
 from scanloom.stages.geometry.se3 import F8
 
@@ -61,13 +62,14 @@ def turned_index(board: Board, index: NDArray[np.int64], T_turn: F8) -> NDArray[
     return np.asarray(np.argmin(apart, axis=1), np.int64)
 
 
-def find_corners(image: U1, board: Board, model: CameraModel) -> ImageBoard | None:
+def find_corners(image: U1, board: Board, model: CameraModel, *, thorough: bool = True) -> ImageBoard | None:
     """Corners of the board in a grey image (h, w); None when it is not seen.
 
     A plain pattern by OpenCV's sector detector (Duda and Frese 2018) in a smaller image, else by its older one, then
-    every corner at its saddle point in the full image; a pattern with markers by these.
+    every corner at its saddle point in the full image; a pattern with markers by these. Not `thorough`: the first of them
+    only, where many images show no board.
     """
-    found = _marked(image, board, board.charuco) if board.charuco else _plain(image, board)
+    found = _marked(image, board, board.charuco) if board.charuco else _plain(image, board, thorough)
     if found is None:
         return None
     index, pixels = found
@@ -105,13 +107,13 @@ _PROBES = ((5, 4), (4, 4), (4, 3), (3, 3))
 # --- plain patterns --------------------------------------------------------------------------------------------------
 
 
-def _plain(image: U1, board: Board) -> tuple[NDArray[np.int64], F8] | None:
+def _plain(image: U1, board: Board, thorough: bool) -> tuple[NDArray[np.int64], F8] | None:
     """Corners in an order that is right-handed with the board's normal towards the camera."""
     m, n = board.inner_corners
     small, scale = _reduced(image)
-    corners = _detected(small, (m, n))
-    if corners is None and scale < 1.0:
-        corners, scale = _detected(image, (m, n)), 1.0
+    corners = _detected(small, (m, n), thorough)
+    if corners is None and scale < 1.0 and thorough:
+        corners, scale = _detected(image, (m, n), thorough), 1.0
     if corners is None:
         return None
     rough = (corners + 0.5) / scale - 0.5
@@ -132,13 +134,16 @@ def _reduced(image: U1) -> tuple[U1, float]:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8), float(half)
 
 
-def _detected(image: U1, size: tuple[int, int]) -> F8 | None:
+def _detected(image: U1, size: tuple[int, int], thorough: bool) -> F8 | None:
     """Corners (m*n, 2), the first dimension running fastest; None where there is no board, or a larger one."""
     import cv2
 
     grid = _sector(image, size)
     if grid is not None:
-        return grid.reshape(-1, 2) if grid.shape[:2] == size[::-1] else None
+        part = pattern_in(image, grid, *size[::-1])
+        return None if part is None else part.reshape(-1, 2)
+    if not thorough:
+        return None
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
     found, corners = cv2.findChessboardCorners(image, size, flags=flags)
     if not found or corners is None or corners.size != 2 * size[0] * size[1]:

@@ -95,7 +95,7 @@ class Watch:
         self.images += 1
         small = _small(image)
         if self._small is None or _changed(small, self._small):
-            found = find_corners(image, self.board, self.model)
+            found = find_corners(image, self.board, self.model, thorough=False)
             self._small, self._corners = small, None if found is None else found.pixels
         if self._corners is None:
             return

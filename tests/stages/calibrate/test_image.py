@@ -9,6 +9,7 @@ import pytest
 from benchmarks.board_scenes import model
 from scanloom.schemas.cameras import CameraModel
 from scanloom.stages.calibrate.board import Board, Charuco
+from scanloom.stages.calibrate.grid import pattern_in
 from scanloom.stages.calibrate.image import board_turn, charuco_pattern, find_corners, grey, pattern_seen
 from scanloom.stages.calibrate.rays import Bearings, on_board
 from scanloom.stages.geometry.camera import project, rays
@@ -106,3 +107,36 @@ def test_bearings_of_the_rim_of_a_fisheye_are_finite():
     m = model(1)
     bearings = Bearings.of(m, np.array([[2.0, 2.0], [m.width_px - 3.0, m.height_px - 3.0]]))
     assert np.isfinite(bearings.slopes).all()
+
+
+@pytest.mark.parametrize("side", ["first", "last", "left", "both"])
+def test_ends_of_squares_are_no_row_of_corners(side):
+    m = model(2)
+    image = drawn(m, BOARD, T_CAMERA_BOARD)
+    x = np.arange(-1, 8)[:, None] - 3.0
+    y = np.arange(-1, 6)[None, :] - 2.0
+    every = np.stack(np.broadcast_arrays(0.095 * x, 0.095 * y, 0.0 * x), axis=-1)
+    pixels = project(m, transform(T_CAMERA_BOARD, every.reshape(-1, 3)))[0].reshape(9, 7, 2)
+    right = pixels[1:8, 1:6]
+    wide = {
+        "first": pixels[:8, 1:6],
+        "last": pixels[1:, 1:6],
+        "left": pixels[1:8, :6],
+        "both": pixels[:, 1:6],
+    }
+    found = pattern_in(image, wide[side], 7, 5)
+    assert found is not None
+    np.testing.assert_allclose(found, right)
+    turned = pattern_in(image, wide[side].transpose(1, 0, 2), 7, 5)
+    assert turned is not None
+    assert sorted(map(tuple, turned.reshape(-1, 2))) == sorted(map(tuple, right.reshape(-1, 2)))
+
+
+def test_part_of_a_larger_pattern_is_not_taken():
+    m = model(2)
+    image = drawn(m, BOARD, T_CAMERA_BOARD)
+    pixels = project(m, transform(T_CAMERA_BOARD, BOARD.corners_m()))[0].reshape(7, 5, 2)
+    assert pattern_in(image, pixels, 6, 5) is None
+    assert pattern_in(image, pixels, 7, 4) is None
+    assert pattern_in(image, pixels, 4, 5) is None
+    assert pattern_in(image, pixels[:5], 7, 5) is None
