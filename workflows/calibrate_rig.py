@@ -44,6 +44,8 @@ log = logging.getLogger("scanloom.calibrate")
 _LEAST_CLOUDS = 4
 """Clouds from which a background can be told from the board."""
 _PROBED = 4
+_MOST_BOARDS = 4
+"""Boards of one cloud that are tried."""
 _SETTINGS: dict[str, type[BaseModel]] = {
     "calibrate": CalibrateSettings,
     "cloud": CloudSettings,
@@ -94,7 +96,6 @@ class Looked:
     clouds: dict[str, PointCloud]
     unseen: dict[str, str]
     """Placements that cannot be used, and why."""
-    boards: dict[str, CloudBoard]
 
 
 def text_of(outcome: Outcome) -> str:
@@ -220,7 +221,7 @@ def look(session: CalibrationSession, settings: CloudSettings) -> Looked:
     searches = search_clouds(clouds, session.board, settings)
     if not any(search.boards for search in searches.values()):
         raise _no_board(session, searches)
-    placements, unseen, boards = [], dict(session.unused), {}
+    placements, unseen = [], dict(session.unused)
     for p in session.placements:
         seen = {c: found for c in p.cameras if (found := images[p.name, c]) is not None}
         if not searches[p.name].boards:
@@ -228,10 +229,10 @@ def look(session: CalibrationSession, settings: CloudSettings) -> Looked:
         elif not seen:
             unseen[p.name] = "no board in the image"
         else:
-            boards[p.name] = searches[p.name].boards[0]
-            placements.append(Placement(p.name, view_of(boards[p.name]), seen))
+            first, *more = (view_of(board) for board in searches[p.name].boards[:_MOST_BOARDS])
+            placements.append(Placement(p.name, first, seen, tuple(more)))
     models = {name: camera.model for name, camera in session.cameras.items()}
-    return Looked(Scene.of(session.board, models, tuple(placements)), clouds, unseen, boards)
+    return Looked(Scene.of(session.board, models, tuple(placements)), clouds, unseen)
 
 
 def view_of(board: CloudBoard) -> LidarView:

@@ -93,6 +93,8 @@ def read_log(path: Path, board: Path | None, settings: LogSettings) -> Calibrati
     reading = _Reading.of(located, read_board(board_file), settings, str(path))
     found = reading.watch()
     placements, unused = reading.take(found) if found else (reading.samples(), {})
+    if not placements:
+        raise _no_scan(found, str(path))
     cameras = {camera.name: camera.camera() for camera in reading.cameras.usable}
     remarks = tuple(reading.cameras.remarks)
     return CalibrationSession(
@@ -315,6 +317,14 @@ def _no_camera(cameras: search.Cameras, where: str) -> InvalidInput:
         "The log has no camera whose lens is known. " + " ".join(cameras.remarks),
         where=where,
         next_step="record the camera info, or give a session.yaml with `cameras: {NAME: {model: FILE}}`",
+    )
+
+
+def _no_scan(found: list[Standstill], where: str) -> InvalidInput:
+    return InvalidInput(
+        f"No standstill has a scan of the LiDAR in it ({len(found)} were seen by the cameras).",
+        where=where,
+        next_step="bring the clocks together with cameras: {NAME: {clock_offset_s: ...}} in a session.yaml",
     )
 
 

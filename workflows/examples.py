@@ -13,7 +13,10 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "extend": ("scanloom extend maps/town wednesday.mcap", "scanloom extend maps/sample sample2 --mode soft"),
     "sample": ("scanloom sample drive --set simulate.duration_s=60",),
     "inspect": ("scanloom inspect drive.mcap", "scanloom inspect session.yaml --json"),
-    "calibrate": ("scanloom calibrate rig --out calibration",),
+    "calibrate": (
+        "scanloom calibrate boards.mcap --board board.yaml --out calibration",
+        "scanloom calibrate rig --out calibration",
+    ),
     "nightly": ("scanloom nightly fleet.yaml --out /maps",),
     "compare": (
         "scanloom compare maps/before maps/after --report comparison.html",

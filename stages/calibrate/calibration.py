@@ -21,7 +21,7 @@ from scanloom.stages.calibrate.noise import Noise
 from scanloom.stages.calibrate.paper import solve_paper
 from scanloom.stages.calibrate.scene import Scene
 from scanloom.stages.calibrate.settings import CalibrateSettings
-from scanloom.stages.calibrate.start import Start, start
+from scanloom.stages.calibrate.start import Start, same_boards, start
 from scanloom.stages.geometry.se3 import F8
 
 VERSION = 1
@@ -54,7 +54,7 @@ def calibrate(scene: Scene, settings: CalibrateSettings, given: Mapping[str, F8]
     InvalidInput : fewer than three placements, lenses or images of two cameras swapped, a board of another size, or
         clouds and images that do not show the same boards.
     """
-    everything = scene
+    everything = scene = same_boards(scene)
     check_count(scene)
     check_lenses(scene)
     left_out = blurred(scene, settings.scatter_px)

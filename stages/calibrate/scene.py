@@ -20,6 +20,8 @@ class Placement:
     name: str
     cloud: LidarView
     images: Mapping[str, ImageBoard]
+    others: tuple[LidarView, ...] = ()
+    """More boards in its cloud; the images may be of one of these."""
 
     def without(self, cameras: Iterable[str]) -> Placement:
         """The same without the images of these cameras."""
@@ -42,7 +44,9 @@ class Scene:
     @classmethod
     def of(cls, board: Board, models: Mapping[str, CameraModel], placements: tuple[Placement, ...]) -> Scene:
         """A scene of all there is."""
-        return cls(board, models, placements, all_beams([p.cloud for p in placements]))
+        return cls(
+            board, models, placements, all_beams([v for p in placements for v in (p.cloud, *p.others)])
+        )
 
     def only(self, names: Iterable[str]) -> Scene:
         """Some of the placements, and the cameras that still see one."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from scanloom.stages.calibrate.image import ImageBoard, board_turn
 from scanloom.stages.calibrate.rays import Bearings, facing
 from scanloom.stages.calibrate.scene import Placement, Scene
+from scanloom.stages.calibrate.view import LidarView
 from scanloom.stages.geometry.se3 import F8, inverse, pose, so3_exp, transform
 
 _AGREE = 0.15
@@ -55,24 +57,48 @@ def start(scene: Scene, given: Mapping[str, F8] | None = None) -> Start:
     return Start(replace(scene, placements=_reordered(scene, ordered)), poses, agreeing)
 
 
+def same_boards(scene: Scene) -> Scene:
+    """Of several boards in a cloud the one that the images show: the choice with which most placements agree."""
+    if not any(p.others for p in scene.placements):
+        return scene
+    corners = scene.board.outline_m()
+    rough = {camera: _consensus(scene, camera) for camera in scene.cameras}
+
+    def cost(p: Placement, cloud: LidarView) -> float:
+        return sum(
+            min(_misfit(rough[c], cloud.T_lidar_board, seen, corners)[0], _AGREE)
+            for c, seen in p.images.items()
+        )
+
+    chosen = (
+        replace(p, cloud=min((p.cloud, *p.others), key=partial(cost, p)), others=()) for p in scene.placements
+    )
+    return replace(scene, placements=tuple(chosen))
+
+
 def _reordered(scene: Scene, ordered: Mapping[str, Mapping[str, ImageBoard]]) -> tuple[Placement, ...]:
     return tuple(replace(p, images=ordered[p.name]) for p in scene.placements)
 
 
 def _consensus(scene: Scene, camera: str) -> F8:
     """The candidate that the most placements agree with, by the sum of their distances, each limited."""
-    views = [(p.cloud.T_lidar_board, p.images[camera]) for p in scene.placements if camera in p.images]
+    views = [(_boards(p), p.images[camera]) for p in scene.placements if camera in p.images]
     corners = scene.board.outline_m()
     candidates = [
         T_lidar_board @ inverse(seen.T_camera_board @ board_turn(turn, _turns(seen)))
-        for T_lidar_board, seen in views
+        for boards, seen in views
+        for T_lidar_board in boards
         for turn in range(_turns(seen))
     ]
     costs = [
-        sum(min(_misfit(T, T_lidar_board, seen, corners)[0], _AGREE) for T_lidar_board, seen in views)
+        sum(min(_AGREE, *(_misfit(T, board, seen, corners)[0] for board in boards)) for boards, seen in views)
         for T in candidates
     ]
     return candidates[int(np.argmin(costs))]
+
+
+def _boards(p: Placement) -> list[F8]:
+    return [view.T_lidar_board for view in (p.cloud, *p.others)]
 
 
 def _turns(seen: ImageBoard) -> int:

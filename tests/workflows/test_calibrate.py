@@ -68,7 +68,7 @@ def seen_as(monkeypatch, scene):
     """What the files show is the simulated scene."""
     cloud = PointCloud(np.random.default_rng(1).uniform(1, 4, (200, 3)), np.ones(200), None)
     placements = scene.placements
-    looked = Looked(scene, {p.name: cloud for p in placements}, {"pose99": "no board in the cloud"}, {})
+    looked = Looked(scene, {p.name: cloud for p in placements}, {"pose99": "no board in the cloud"})
     monkeypatch.setattr(rig, "look", lambda session, settings: looked)
 
 

@@ -149,7 +149,7 @@ class _Film:
 
 def _images(session: BoardSession, timing: Timing) -> Iterator[Entry]:
     film = _Film(session)
-    for n in range(int(duration_s(session, timing) / timing.image_s)):
+    for n in range(int(duration_s(session, timing) / timing.image_s) + 1):
         time_s = n * timing.image_s
         stamp_ns, now = _START_NS + round(time_s * 1e9), moment(session, timing, time_s)
         for index, camera in enumerate(session.given):

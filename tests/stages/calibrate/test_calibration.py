@@ -91,6 +91,22 @@ def test_three_bad_placements_are_named_and_left_out():
     )
 
 
+def test_of_two_boards_in_a_cloud_the_one_in_the_images_is_taken():
+    scene, _ = simulate(World(cameras=2, placements=8), 32)
+    elsewhere, _ = simulate(World(cameras=2, placements=8), 33)
+    standing = elsewhere.placements[0].cloud
+    doubled = tuple(
+        replace(p, cloud=standing, others=(p.cloud,)) if k % 2 else replace(p, others=(standing,))
+        for k, p in enumerate(scene.placements)
+    )
+    settings = CalibrateSettings(halves=0)
+    alone = calibrate(scene, settings).estimate.T_lidar_camera
+    both = calibrate(Scene.of(scene.board, scene.models, doubled), settings)
+    assert not both.left_out
+    for camera, T in both.estimate.T_lidar_camera.items():
+        np.testing.assert_allclose(T, alone[camera], atol=1e-6)
+
+
 @pytest.mark.parametrize(("placements", "fine"), [(2, False), (3, True)])
 def test_three_placements_are_the_least(placements, fine):
     scene, poses = simulate(World(cameras=1, placements=placements), 41)
