@@ -45,6 +45,12 @@ PRODUCTS = (Images, Cameras, Poses, ObjectTracks, Piece, Truth, Deskewed, FinalL
 WORK = Path("build/bench")
 PREFIX = "bench.colour"
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+SURE, FULL = 0.99, 0.15
+FITTED = {
+    "one": "one factor for all light of the map, fitted to points in full light",
+    "each": "one factor for each of red, green, blue, fitted to points in full light",
+    "none": "nothing fitted",
+}
 
 console = Console(stderr=True, width=200)
 
@@ -105,7 +111,9 @@ def _of_drive(seed: int, options: argparse.Namespace) -> Iterator[Figure]:
     truth = known(result)
     world = World(Simulate(**chosen), result)
     found = (
-        _coloured(truth, colours) | {"seams": np.array(list(_seams(stretches)))} | {"seen": world.seen(truth)}
+        _coloured(truth, colours)
+        | {"seams": np.array(list(_seams(stretches)))}
+        | {"seen": world.seen(truth), "falling": world.falling(truth)}
     )
     if options.keep:
         options.keep.mkdir(parents=True, exist_ok=True)
@@ -158,59 +166,62 @@ def _seams(stretches: list[list[Any]]) -> Iterator[float]:
 
 def _scores(truth: Known, found: dict[str, np.ndarray]) -> Iterator[tuple[str, float, str, str]]:
     """Name, value, unit and method of each figure."""
-    has, seen = found["views"] > 0, found["seen"]
-    light = LINEAR[found["colour"]]
-    judged = has & (truth.static > 0.99) & (truth.lit > 0.99)
+    has, light = found["views"] > 0, LINEAR[found["colour"]]
+    sunny = has & (truth.static > SURE) & (truth.lit > SURE)
+    surface = truth.normal.any(axis=1)
+    full = sunny & surface & (np.abs(found["falling"] @ LUMINANCE - 1.0) < FULL)
     yield "points", float(len(has)), "", "points of the map"
-    yield "judged", float(judged.sum()), "", "static points in the sun that have a colour"
-    one = np.median((truth.albedo[judged] @ LUMINANCE) / np.maximum(light[judged] @ LUMINANCE, 1e-6))
-    each = np.median(truth.albedo[judged] / np.maximum(light[judged], 1e-6), axis=0)
-    for name, gain, how in (
-        ("", one, "one factor for all light of the map fitted"),
-        ("_as_it_is", 1.0, "nothing fitted"),
-        ("_by_channel", each, "one factor for each of red, green, blue fitted"),
-    ):
-        error = np.abs(srgb(light * gain).astype(int) - srgb(truth.albedo).astype(int)).mean(axis=1)
-        where = f"mean difference of the three channels to albedo as sRGB; {how}"
-        yield (
-            f"error{name}_median",
-            float(np.median(error[judged])),
-            "/255",
-            f"median, lit static points; {where}",
-        )
-        yield f"error{name}_p90", float(np.percentile(error[judged], 90)), "/255", f"90th percentile; {where}"
-        if name == "":
-            for kind, of_kind in (("ground", truth.ground > 0.99), ("standing", truth.ground < 0.01)):
-                yield (
-                    f"error_{kind}_median",
-                    float(np.median(error[judged & of_kind])),
-                    "/255",
-                    f"median, {kind}; {where}",
-                )
-            shade = has & (truth.static > 0.99) & (truth.lit < 0.01)
-            yield (
-                "error_shade_median",
-                float(np.median(error[shade])),
-                "/255",
-                f"median, in the shade; {where}",
-            )
-            false = judged & ~seen
-            yield (
-                "error_false_median",
-                float(np.median(error[false])),
-                "/255",
-                f"median, of what no camera saw; {where}",
-            )
-    yield "gain", float(one), "", "the one factor: how much brighter the map had to be"
+    yield "sunny_points", float(sunny.sum()), "", "static points in the sun that have a colour"
+    yield (
+        "full_light",
+        float(full.sum() / sunny.sum()),
+        "",
+        f"of these, those in as much light as level ground, within {FULL:.0%}",
+    )
+    factors = _factors(truth, light, full)
+    radiance = truth.albedo * found["falling"]
+    for name, rows, target, fitted, what in (
+        ("error", full, truth.albedo, "one", "in full light, to albedo"),
+        ("error_all", sunny, truth.albedo, "one", "in the sun at any angle, to albedo"),
+        ("error_radiance", sunny & surface, radiance, "one", "in the sun at any angle, to albedo times the light that falls there"),
+        ("error_radiance_ground", sunny & surface & (truth.ground > SURE), radiance, "one", "ground, to albedo times light"),
+        ("error_radiance_standing", sunny & surface & (truth.ground < 1 - SURE), radiance, "one", "standing, to albedo times light"),
+        ("error_by_channel", full, truth.albedo, "each", "in full light, to albedo"),
+        ("error_as_it_is", full, truth.albedo, "none", "in full light, to albedo"),
+    ):  # fmt: skip
+        off = _off(light[rows] * factors[fitted], target[rows])
+        how = f"static points {what}; mean difference of three sRGB values; {FITTED[fitted]}"
+        yield f"{name}_median", float(np.median(off)), "/255", f"median, {how}"
+        yield f"{name}_p90", float(np.percentile(off, 90)), "/255", f"90th percentile, {how}"
+    yield "factor", float(factors["one"]), "", "the one factor: what the light of the map is multiplied with"
+    yield from _presence(has, found["seen"])
+    for number, seam in enumerate(found["seams"]):
+        how = "how much brighter the next stretch is before `brightness` evens it out, median"
+        yield f"seam_{number}", 100.0 * seam, "%", how
+
+
+def _factors(truth: Known, light: np.ndarray, full: np.ndarray) -> dict[str, Any]:
+    """What the light of the map is multiplied with: fitted to the albedo of points in full light."""
+    one = np.median((truth.albedo[full] @ LUMINANCE) / (light[full] @ LUMINANCE))
+    return {"one": one, "each": np.median(truth.albedo[full] / light[full], axis=0), "none": 1.0}
+
+
+def _off(light: np.ndarray, target: np.ndarray) -> np.ndarray:
+    return np.asarray(np.abs(srgb(light).astype(int) - srgb(target).astype(int)).mean(axis=1))
+
+
+def _presence(has: np.ndarray, seen: np.ndarray) -> Iterator[tuple[str, float, str, str]]:
+    """Colour where there should be some, and where there should be none."""
+    false = float((has & ~seen).sum())
     yield (
         "false_colour",
-        100.0 * float((has & ~seen).sum() / has.sum()),
+        100.0 * false / has.sum(),
         "%",
         "of the points with a colour, those that truly no camera saw",
     )
     yield (
         "unseen_coloured",
-        100.0 * float((has & ~seen).sum() / (~seen).sum()),
+        100.0 * false / (~seen).sum(),
         "%",
         "of the points that truly no camera saw, those with a colour",
     )
@@ -220,13 +231,6 @@ def _scores(truth: Known, found: dict[str, np.ndarray]) -> Iterator[tuple[str, f
         "%",
         "of the points that a camera saw, those with a colour",
     )
-    for number, seam in enumerate(found["seams"]):
-        yield (
-            f"seam_{number}",
-            100.0 * seam,
-            "%",
-            "how much brighter the next stretch is before `brightness` evens it out, median",
-        )
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from scanloom.schemas.trajectory import Truth
 from scanloom.stages.geometry.camera import project
 from scanloom.stages.geometry.interpolation import interpolate_poses
 from scanloom.stages.geometry.se3 import F8, inverse, transform
+from scanloom.stages.simulate.daylight import Daylight
 from scanloom.stages.simulate.eye import meet
 from scanloom.stages.simulate.motion import build_motion
 from scanloom.stages.simulate.rig import T_BASE, vehicle
@@ -41,6 +42,7 @@ class World:
         self._settings, self._path = settings, town.path
         self._movers = build_traffic(settings, town.path, motion)
         self._town = scene_of(town.triangles()[0])
+        self._light = Daylight(settings, self._town)
         self._bodies = [scene_of(mover.mesh) for mover in self._movers]
         self._own = scene_of(vehicle())
         truth = result.parts(Truth)[0]
@@ -49,6 +51,12 @@ class World:
         true = Cameras.model_validate_json((folder / "cameras.json").read_text())
         self._cameras = {camera.name: camera for camera in true.cameras}
         self._shots = [(image.camera, image.stamp_ns) for part in result.parts(Images) for image in part]
+
+    def falling(self, points: Known) -> F8:
+        """Light (n, 3) that falls on the points; level ground in the open sun gets 1."""
+        above = points.place + OFF_SURFACE_M * points.normal
+        light, _ = self._light.falling(above, points.normal, self._light.under_sky(above, points.normal))
+        return light.astype(float)
 
     def seen(self, points: Known) -> B1:
         """Which of the points any image shows from at most `REACH_M`."""

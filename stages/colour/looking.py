@@ -77,6 +77,7 @@ class Looker:
             camera=np.full(count, shot.camera_number, np.int32),
             cell=cells_of(shot, at[good]),
             ring=rings_of(shot, at[good]),
+            away=away[good].astype(np.float32),
             light=np.log(np.maximum(light[good], 1e-5)).astype(np.float32),
             weight=weight[good].astype(np.float32),
         )

@@ -12,70 +12,90 @@ from scanloom.stages.geometry.se3 import F8
 
 F4 = NDArray[np.float32]
 B1 = NDArray[np.bool_]
+I8 = NDArray[np.int64]
 
 CELLS = 320
 """Cells of the depth image across the picture."""
-STEEPEST = 12.0
-"""Tangent of the angle between ray and normal beyond which a surface is not followed any further."""
 WIDEST_CELLS = 40
+SLOPE = 0.1
+"""Surfaces are flat to so much, and normals true: what is farther aside may stand out by so much more."""
 
 
 def visible(
     model: CameraModel, points: F8, normal: F4, voxel_m: float, margin_px: float, tolerance_m: float
-) -> tuple[F8, F4, NDArray[np.int64]]:
+) -> tuple[F8, F4, I8]:
     """Pixels (m, 2), cosines (m,) between ray and normal, and rows (m,) of the points that the camera sees.
 
     points : (n, 3) in the camera's axes, m. normal : (n, 3) in the same axes, zeros where there is none.
 
-    A point is seen when nothing within `margin_px` of it is nearer than its own surface would be there. The
-    margin keeps away from edges, where calibration, motion and lens mix two things in one pixel.
+    A point is seen when nothing within `margin_px` of it is nearer and stands out of its surface. The margin keeps away
+    from edges, where calibration, motion and lens mix two things in one pixel.
     """
     pixels, seen = project(model, points)
     rows = np.flatnonzero(seen)
-    away = np.linalg.norm(points[rows], axis=1)
+    pixels, points = np.ascontiguousarray(pixels[rows]), np.ascontiguousarray(points[rows])
+    towards = normal[rows].astype(np.float64)
+    away = np.linalg.norm(points, axis=1)
+    facing = np.einsum("ni,ni->n", points, towards) / np.maximum(away, 1e-9)
+    towards[facing > 0] *= -1.0
     cell_px = max(model.width_px / CELLS, 1.0)
-    focal = 0.5 * (model.fx_px + model.fy_px)
-    depth = depth_image(
-        pixels[rows], away, focal * voxel_m, cell_px, int(model.width_px / cell_px) + 2,
-        int(model.height_px / cell_px) + 2,
-    )  # fmt: skip
+    size_px_m = 0.5 * (model.fx_px + model.fy_px) * voxel_m
+    first = nearest(pixels, away, size_px_m, cell_px, (model.height_px, model.width_px))
     reach = int(np.ceil(margin_px / cell_px))
-    nearest = _least_around(depth, reach)
-    u, v = ((pixels[rows] + 0.5) / cell_px).astype(np.int64).T
-    facing = np.abs(np.einsum("ni,ni->n", points[rows], normal[rows].astype(float))) / np.maximum(away, 1e-9)
-    cosine = np.where(normal[rows].any(axis=1), facing, 0.5)
-    steep = np.minimum(np.sqrt(1.0 - np.minimum(cosine, 1.0) ** 2) / np.maximum(cosine, 1e-3), STEEPEST)
-    around_m = voxel_m + (reach + 1) * cell_px / focal * away
-    keep = away <= nearest[v, u] + tolerance_m + steep * around_m
-    return pixels[rows[keep]], cosine[keep].astype(np.float32), rows[keep]
+    keep = _free(pixels, points, away, towards, first, cell_px, reach, tolerance_m)
+    cosine = np.where(towards.any(axis=1), np.abs(facing), 0.5)
+    return pixels[keep], cosine[keep].astype(np.float32), rows[keep]
 
 
-def depth_image(pixels: F8, away: F8, size_px_m: float, cell_px: float, width: int, height: int) -> F4:
-    """Nearest distance (height, width) in each cell; a point at distance d covers `size_px_m` / d pixels to each side."""
-    out = np.full((height, width), np.inf, np.float32)
-    _splat(np.ascontiguousarray(pixels), np.ascontiguousarray(away), size_px_m, cell_px, out)
-    return out
+def nearest(pixels: F8, away: F8, size_px_m: float, cell_px: float, shape: tuple[int, int]) -> I8:
+    """Number of the nearest point in each cell of a picture of `shape`, -1 where there is none; a point at distance d
+    covers `size_px_m` / d pixels to each side."""
+    height, width = (int(side / cell_px) + 2 for side in shape)
+    first, depth = np.full((height, width), -1, np.int64), np.full((height, width), np.inf)
+    _splat(pixels, away, size_px_m, cell_px, first, depth)
+    return first
 
 
 @kernel
-def _splat(pixels: F8, away: F8, size_px_m: float, cell_px: float, out: F4) -> None:
-    height, width = out.shape
+def _splat(pixels: F8, away: F8, size_px_m: float, cell_px: float, first: I8, depth: F8) -> None:
+    height, width = first.shape
     for n in range(len(away)):
         half = min(size_px_m / away[n] / cell_px, float(WIDEST_CELLS))
         u, v = (pixels[n, 0] + 0.5) / cell_px, (pixels[n, 1] + 0.5) / cell_px
-        d = np.float32(away[n])
         for j in range(max(int(v - half), 0), min(int(v + half), height - 1) + 1):
             for i in range(max(int(u - half), 0), min(int(u + half), width - 1) + 1):
-                if d < out[j, i]:
-                    out[j, i] = d
+                if away[n] < depth[j, i]:
+                    depth[j, i], first[j, i] = away[n], n
 
 
-def _least_around(depth: F4, reach: int) -> F4:
-    import cv2
+@kernel
+def _free(
+    pixels: F8, points: F8, away: F8, towards: F8, first: I8, cell_px: float, reach: int, tolerance_m: float
+) -> B1:
+    """Which points have nothing before them in the cells around theirs.
 
-    if reach == 0:
-        return depth
-    return np.asarray(cv2.erode(depth, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)), np.float32)
+    What is nearer by more than the tolerance hides a point if it stands out of the plane through it. A point without a
+    normal is hidden by whatever is nearer by twice as much.
+    """
+    height, width = first.shape
+    free = np.ones(len(away), np.bool_)
+    for n in range(len(away)):
+        u, v = int((pixels[n, 0] + 0.5) / cell_px), int((pixels[n, 1] + 0.5) / cell_px)
+        flat = towards[n, 0] != 0.0 or towards[n, 1] != 0.0 or towards[n, 2] != 0.0
+        for j in range(max(v - reach, 0), min(v + reach, height - 1) + 1):
+            for i in range(max(u - reach, 0), min(u + reach, width - 1) + 1):
+                k = first[j, i]
+                if k < 0 or away[k] >= away[n] - (tolerance_m if flat else 2.0 * tolerance_m):
+                    continue
+                x, y, z = (
+                    points[k, 0] - points[n, 0],
+                    points[k, 1] - points[n, 1],
+                    points[k, 2] - points[n, 2],
+                )
+                out = x * towards[n, 0] + y * towards[n, 1] + z * towards[n, 2]
+                if not flat or out > tolerance_m + SLOPE * np.sqrt(x * x + y * y + z * z):
+                    free[n] = False
+    return free
 
 
 def through_boxes(origin: F8, points: F8, boxes: F8, half: F8) -> B1:

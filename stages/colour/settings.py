@@ -19,7 +19,7 @@ class Settings(BaseModel):
         description="an image taken so near to the camera's last one, and turned by less than 5 degrees, adds nothing, m",
     )  # fmt: skip
     tolerance_m: float = Field(
-        0.3, ge=0.01, le=5.0, description="a point so far behind what hides it is still seen, m"
+        0.15, ge=0.01, le=5.0, description="what stands out of a point's surface by no more hides nothing, m"
     )
     margin_px: float = Field(
         3.0, ge=0.0, le=50.0, description="pixels beside the edge of something nearer that colour nothing, px"

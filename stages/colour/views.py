@@ -30,6 +30,8 @@ class Views:
     """Of the camera's picture, see `cells_of`."""
     ring: I4
     """How far from the middle of the picture, 0 inside; see `rings_of`."""
+    away: F4
+    """From the camera, m."""
     light: F4
     """(n, 3) logarithm of linear red, green, blue."""
     weight: F4

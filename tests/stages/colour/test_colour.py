@@ -142,3 +142,23 @@ def test_a_tile_with_colour_has_it_in_its_ply() -> None:
     rows = np.frombuffer(body, ply.COLOURED)
     assert np.array_equal(np.column_stack([rows[c] for c in ("red", "green", "blue")]), made.colour)
     assert b"red" not in tile_ply(tile([])).partition(b"end_header\n")[0]
+
+
+def test_a_camera_that_stands_still_adds_one_image() -> None:
+    pictures = [image(picture(START + np.array((0.0, 0.3 * n, 0.0))), n) for n in range(4)]
+    for apart_m, most in ((0.0, 4), (0.3 - 1e-6, 4), (0.31, 2), (10.0, 1)):
+        assert tile(painted(pictures, path(4, step_m=0.3), apart_m=apart_m)).views.max() == most, apart_m
+
+
+def test_a_view_that_disagrees_is_left_out() -> None:
+    spoilt = picture(START + np.array((0.0, 0.3, 0.0)))
+    spoilt[:, 400:] = (40, 200, 250)
+    pictures = [image(picture(START + np.array((0.0, 0.3 * n, 0.0))), n) for n in (0, 2, 3)]
+    pictures.insert(1, image(spoilt, 1))
+    poses = path(4, step_m=0.3)
+    good = tile(painted([pictures[0], *pictures[2:]], poses, apart_m=0.0))
+    made = tile(painted(pictures, poses, apart_m=0.0))
+    both = (good.views == 3) & (made.views > 0) & (made.x_m > 19.5)
+    assert both.sum() > 3000 and (made.views[both] == 3).sum() > 1000
+    off = np.abs(made.colour[both].astype(int) - good.colour[both]).max(axis=1)
+    assert np.quantile(off, 0.95) <= 8
