@@ -103,6 +103,7 @@ def _noise(settings: CalibrateSettings) -> Noise:
         corner_least_px=settings.corner_least_px,
         beam_offset_m=settings.beam_offset_m,
         lens_share=settings.lens_share,
+        lens_bend_px=settings.lens_bend_px,
     )
     return noise if settings.lidar == "estimated" else noise.believing()
 

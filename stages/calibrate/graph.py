@@ -15,6 +15,7 @@ import numpy as np
 
 from scanloom.schemas.cameras import CameraModel
 from scanloom.stages.calibrate.factors import corner_rows, softened
+from scanloom.stages.calibrate.lens import by_intrinsics, corrected, prior_sigmas
 from scanloom.stages.calibrate.noise import Noise
 from scanloom.stages.calibrate.rays import Bearings
 from scanloom.stages.calibrate.scene import Placement, Scene
@@ -117,8 +118,9 @@ def _add_sensors(
     vector(key.sensor, sensor.covariance)
     for camera in scene.cameras:
         values.insert(key.camera(camera), gtsam.Pose3(start[camera]))
-        if noise.lens_share > 0:
-            vector(key.lens(camera), np.eye(4) * (noise.lens_share * scene.models[camera].fx_px) ** 2)
+        if noise.lens_free:
+            sigmas = prior_sigmas(scene.models[camera], noise.lens_share, noise.lens_bend_px)
+            vector(key.lens(camera), np.diag(sigmas**2))
 
 
 def _cloud_factor(key: _Keys, name: str, cloud: Rows) -> Any:
@@ -133,15 +135,16 @@ def _corner_factor(key: _Keys, scene: Scene, p: Placement, camera: str, seen: Be
     corners = scene.corners(p, camera)
     sigma = max(p.images[camera].sigma_px, noise.corner_least_px)
     keys = [key.camera(camera), key.board(p.name)]
-    if noise.lens_share > 0:
+    if noise.lens_free:
         keys.append(key.lens(camera))
+    moves = by_intrinsics(scene.models[camera], seen.directions) if noise.lens_free else None
 
     def rows(T_lidar_camera: F8, T_lidar_board: F8, lens: F8 | None = None) -> tuple[F8, list[F8]]:
         error, by_camera, by_board = corner_rows(T_lidar_camera, T_lidar_board, corners, seen)
         slopes = [by_camera, by_board]
-        if lens is not None:
-            error = error + seen.by_intrinsics @ lens
-            slopes.append(seen.by_intrinsics)
+        if lens is not None and moves is not None:
+            error = error + moves @ lens
+            slopes.append(moves)
         by_error, by_slope = softened(error / sigma, noise.softness)
         weighed = [(J / sigma * by_slope[:, :, None]).reshape(-1, J.shape[2]) for J in slopes]
         return (error / sigma * by_error).ravel(), weighed
@@ -182,7 +185,7 @@ def _estimate(
     sensor = Sensor(scene.beams, mean, np.asarray(marginals.marginalCovariance(key.sensor)))
     scale = _scale([rows[name].at(T, mean)[0] for name, T in boards.items()], len(cameras))
     models = dict(scene.models)
-    if noise.lens_share > 0:
+    if noise.lens_free:
         models = {c: corrected(m, solved.atVector(key.lens(c))) for c, m in models.items()}
     return Estimate(cameras, boards, sensor, models, covariance * scale**2, scale, rows)
 
@@ -191,9 +194,3 @@ def _scale(errors: Sequence[F8], cameras: int) -> float:
     """By how much the clouds miss the boards, in units of their noise; boards that the images hold take no freedom."""
     freedom = sum(len(e) for e in errors) - 6 * cameras
     return max(1.0, float(np.sqrt(sum(e @ e for e in errors) / max(freedom, 6))))
-
-
-def corrected(model: CameraModel, shift: F8) -> CameraModel:
-    """A model with its fx, fy, cx, cy moved by `shift` (4,), px."""
-    fields = ("fx_px", "fy_px", "cx_px", "cy_px")
-    return model.model_copy(update={f: getattr(model, f) + float(d) for f, d in zip(fields, shift)})

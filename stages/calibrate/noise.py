@@ -29,6 +29,13 @@ class Noise:
     """Corners beyond so many standard deviations count linearly (Huber)."""
     lens_share: float = 0.0
     """Standard deviation of focal lengths and centre as a share of the focal length; 0 keeps them as given."""
+    lens_bend_px: float = 0.0
+    """How far each coefficient of the lens may be off, by what it does at a corner of the image; 0 keeps them as given."""
+
+    @property
+    def lens_free(self) -> bool:
+        """Whether intrinsics are estimated along."""
+        return self.lens_share > 0 or self.lens_bend_px > 0
 
     @property
     def bias_sigmas(self) -> F8:

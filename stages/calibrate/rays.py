@@ -25,8 +25,6 @@ class Bearings:
     pixels: F8
     directions: F8
     slopes: F8
-    by_intrinsics: F8
-    """(n, 2, 4): how a pixel moves with fx, fy, cx, cy."""
 
     @classmethod
     def of(cls, model: CameraModel, pixels: F8) -> Bearings:
@@ -37,11 +35,7 @@ class Bearings:
             ahead, _ = project(model, directions + _STEP * axis)
             behind, _ = project(model, directions - _STEP * axis)
             columns.append((ahead - behind) / (2 * _STEP))
-        plane = (pixels - (model.cx_px, model.cy_px)) / (model.fx_px, model.fy_px)
-        moves = np.zeros((len(pixels), 2, 4))
-        moves[:, 0, 0], moves[:, 1, 1] = plane[:, 0], plane[:, 1]
-        moves[:, 0, 2] = moves[:, 1, 3] = 1.0
-        return cls(np.asarray(pixels, np.float64), directions, np.stack(columns, axis=-1), moves)
+        return cls(np.asarray(pixels, np.float64), directions, np.stack(columns, axis=-1))
 
     def errors(self, points: F8) -> tuple[F8, F8]:
         """Errors (n, 2), px, of points (n, 3) of the camera, and their derivatives (n, 2, 3) by the points."""

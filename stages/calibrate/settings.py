@@ -39,6 +39,12 @@ class CalibrateSettings(BaseModel):
         le=0.05,
         description="how far focal lengths and centre may be from what was given, one sigma, as a share of the focal length; 0 keeps them",
     )
+    lens_bend_px: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=50.0,
+        description="how far each coefficient of the lens may be from what was given, one sigma, px at a corner of the image; 0 keeps them",
+    )
     scatter_px: float = Field(
         default=1.0,
         ge=0.1,

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanloom.stages.calibrate.board import Board
+from scanloom.stages.calibrate.image import charuco_pattern
 from scanloom.stages.geometry.se3 import inverse, pose, so3_exp
 
 F8 = NDArray[np.float64]
@@ -172,8 +173,29 @@ def _panel(panel: Panel, start: F8, direction: F8) -> tuple[F8, F8, F8]:
             + np.asarray(panel.board.squares) / 2
         )
         printed = ((square >= 0) & (square < panel.board.squares)).all(axis=1)
-        albedo[printed & (square.sum(axis=1) % 2 == 0)] = 0.04
+        if panel.board.charuco is None:
+            albedo[printed & (square.sum(axis=1) % 2 == 0)] = 0.04
+        else:
+            albedo[printed] = np.where(
+                _marked(panel.board, x[printed] + panel.board.offset_m), 0.04, albedo[printed]
+            )
     return np.where(hit, r, np.inf), np.abs(d[:, 2]), albedo
+
+
+def _marked(board: Board, xy: F8) -> NDArray[np.bool_]:
+    """Whether places (n, 2) of a pattern with markers are dark."""
+    size = tuple(_PX_A_SQUARE * squares for squares in board.squares)
+    image = charuco_pattern(board, board.charuco).generateImage(size)
+    column, row = (
+        np.clip(
+            (side * xy[:, k] / board.square_m + board.squares[k] / 2) * _PX_A_SQUARE, 0, size[k] - 1
+        ).astype(int)
+        for k, side in ((0, 1), (1, -1))
+    )
+    return np.asarray(image[row, column] < 128)
+
+
+_PX_A_SQUARE = 40
 
 
 def _ball(ball: Ball, start: F8, direction: F8) -> tuple[F8, F8, F8]:

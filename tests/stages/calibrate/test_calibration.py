@@ -91,6 +91,44 @@ def test_three_bad_placements_are_named_and_left_out():
     )
 
 
+def test_a_lens_that_bends_otherwise_is_put_right():
+    scene, poses = simulate(World(cameras=2, placements=12), 51)
+    wrong = {name: _bent(lens) for name, lens in scene.models.items()}
+    bent = Scene.of(scene.board, wrong, scene.placements)
+    told = tuple(
+        replace(p, images={c: refitted(bent, scene.board, c, seen) for c, seen in p.images.items()})
+        for p in scene.placements
+    )
+    bent = replace(bent, placements=told)
+    given = calibrate(bent, CalibrateSettings(halves=0, scatter_px=5.0)).estimate
+    freed = calibrate(bent, CalibrateSettings(halves=0, scatter_px=5.0, lens_bend_px=8.0)).estimate
+    before, after = (
+        np.sqrt(np.mean([turn_and_shift(poses[c], T)[1] ** 2 for c, T in e.T_lidar_camera.items()]))
+        for e in (given, freed)
+    )
+    assert 0.003 < before < 0.05 and 0.0003 < after < before / 2
+    for camera, lens in scene.models.items():
+        left = abs(freed.models[camera].distortion[0] - lens.distortion[0])
+        assert 1e-6 < left < 0.4 * abs(wrong[camera].distortion[0] - lens.distortion[0])
+        assert freed.models[camera].fx_px == pytest.approx(lens.fx_px, abs=1e-3)
+
+
+def _bent(lens):
+    return lens.model_copy(update={"distortion": (lens.distortion[0] + 0.01, *lens.distortion[1:])})
+
+
+def test_a_free_focal_length_is_paid_for_in_certainty():
+    scene, poses = simulate(World(cameras=1, placements=12), 53)
+    kept, freed = (
+        calibrate(scene, CalibrateSettings(halves=0, lens_share=share)).estimate for share in (0.0, 0.005)
+    )
+    sigma = [np.sqrt(np.diag(e.camera_covariance("cam0"))) for e in (kept, freed)]
+    assert 2.0 < sigma[1][3:].max() / sigma[0][3:].max() < 20.0
+    xi = se3_log(inverse(poses["cam0"]) @ freed.T_lidar_camera["cam0"])
+    assert 0.1 < np.abs(xi / sigma[1]).max() < 3.0
+    assert freed.models["cam0"].distortion == pytest.approx(scene.models["cam0"].distortion, abs=1e-6)
+
+
 def test_of_two_boards_in_a_cloud_the_one_in_the_images_is_taken():
     scene, _ = simulate(World(cameras=2, placements=8), 32)
     elsewhere, _ = simulate(World(cameras=2, placements=8), 33)

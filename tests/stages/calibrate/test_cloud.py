@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scanloom.stages.calibrate.board import Board, read_board
+from scanloom.stages.calibrate.board import Board, Charuco, read_board
 from scanloom.stages.calibrate.cloud import CloudBoard, CloudSettings, Search, search_boards, static_points
 from scanloom.stages.geometry.se3 import F8, inverse, pose, se3_log, so3_exp, transform
 from scanloom.stages.logs.pcd import read_pcd
@@ -156,6 +156,19 @@ def test_two_boards_in_view() -> None:
     for T in (DIAMOND, other):
         near = min(found, key=lambda b: np.linalg.norm(b.T_lidar_board[:3, 3] - T[:3, 3]))
         assert sigmas(near, T).max() < 3.5
+
+
+@pytest.mark.parametrize("T", [DIAMOND, UPRIGHT], ids=["diamond", "upright"])
+def test_a_board_with_markers_in_its_squares(T: F8) -> None:
+    marked = BOARD.model_copy(update={"charuco": Charuco(dictionary="DICT_5X5_100", marker_m=0.07)})
+    result = searched([board_panel(T, marked)], board=marked)
+    assert len(result.boards) == 1
+    board = result.boards[0]
+    off = np.abs(error(board, T))
+    assert sigmas(board, T).max() < 3.5
+    assert 0 < off[:3].max() < np.radians(1.2)
+    assert 0 < off[3:5].max() < 0.006 and off[5] < 0.02
+    assert 0.4 < board.contrast < 0.95
 
 
 def test_no_board_is_no_board() -> None:
