@@ -57,3 +57,12 @@ def georeference_comments(
             "point_scale {point_scale:.9f}".format(**georeference),
         ]
     return comments
+
+
+def without_colour(rows: bytes) -> bytes:
+    """Vertices `COLOURED` as `VERTEX`."""
+    coloured = np.frombuffer(rows, COLOURED)
+    out = np.empty(len(coloured), VERTEX)
+    for name in VERTEX.names or ():
+        out[name] = coloured[name]
+    return out.tobytes()

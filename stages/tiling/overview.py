@@ -46,7 +46,7 @@ def overview(
 ) -> tuple[TileIndex, Overview, MapFiles]:
     """List the tiles with bounds and checksums, gather their coarsest levels, write `map.ply` and `removed.ply`.
 
-    `removed.ply` has all points that are left out of the map, `map.ply` one point in each coarser voxel. They have
+    `removed.ply` has all points that are left out of the map, `map.ply` one point in each coarser voxel, with colours where cameras saw any. They have
     float32 coordinates from the origin of the map: steps of 0.06 mm at 1 km and 1 mm at 10 km. Tiles are read once and
     are in memory one by one; of all of them only what the overview holds.
 
@@ -62,21 +62,24 @@ def overview(
     surveys: list[Survey] = []
     coarsest = _Coarsest(settings.overview_points)
     spool = tempfile.SpooledTemporaryFile(HELD_BYTES)  # noqa: SIM115  it lives until map.ply is written
+    coloured = False
     for where, tile in tiles.items():
         surveys.append(_survey(where["tile"], tile))
         coarsest.add(where["tile"], tile)
-        spool.write(_vertices(tile, coarse_picks(tile, settings.map_voxel_size_m)))
+        spool.write(_vertices(tile, coarse_picks(tile, settings.map_voxel_size_m), ply.COLOURED))
+        coloured |= bool(tile.views.any())
     index = tile_index(surveys, tiles[0])
     comments = ply.georeference_comments(index.frame, index.georeference, (0.0, 0.0, 0.0))
 
     def write_map(stream: IO[bytes]) -> None:
-        stream.write(ply.header(spool.tell() // ply.VERTEX.itemsize, ["scanloom map", *comments]))
-        stream.writelines(_contents(spool))
+        vertex = ply.COLOURED if coloured else ply.VERTEX
+        stream.write(ply.header(spool.tell() // ply.COLOURED.itemsize, ["scanloom map", *comments], vertex))
+        stream.writelines(_contents(spool, coloured))
 
     def write_removed(stream: IO[bytes]) -> None:
         left_out = removed if removed is not None else ()
         stream.write(ply.header(sum(map(len, left_out)), ["scanloom points left out of the map", *comments]))
-        stream.writelines(_vertices(tile, np.arange(len(tile))) for tile in left_out)
+        stream.writelines(_vertices(tile, np.arange(len(tile)), ply.VERTEX) for tile in left_out)
 
     return (
         index,
@@ -85,11 +88,11 @@ def overview(
     )
 
 
-def _contents(spool: IO[bytes]) -> Iterator[bytes]:
-    """All that was written to a file, which is left at its end."""
+def _contents(spool: IO[bytes], coloured: bool) -> Iterator[bytes]:
+    """All vertices that were written to a file, which is left at its end; with their colours, or without."""
     spool.seek(0)
-    while block := spool.read(1 << 24):
-        yield block
+    while block := spool.read(ply.COLOURED.itemsize << 20):
+        yield block if coloured else ply.without_colour(block)
 
 
 @dataclass(frozen=True)
@@ -222,8 +225,9 @@ def coarse_picks(tile: Tile, voxel_size_m: float) -> NDArray[np.int64]:
     return downsample(np.column_stack((tile.x_m, tile.y_m, tile.z_m)), voxel_size_m)
 
 
-def _vertices(tile: Tile, picks: NDArray[np.int64]) -> bytes:
+def _vertices(tile: Tile, picks: NDArray[np.int64], vertex: np.dtype[Any]) -> bytes:
     """Vertices of some points of a tile, in the frame of the map."""
     local = np.column_stack((tile.x_m[picks], tile.y_m[picks], tile.z_m[picks]))
     points = (local + np.array(tile.offset_m)).astype(np.float32)
-    return ply.vertices(points, tile.intensity[picks], tile.class_[picks])
+    colour = tile.colour[picks] if vertex == ply.COLOURED else None
+    return ply.vertices(points, tile.intensity[picks], tile.class_[picks], colour)

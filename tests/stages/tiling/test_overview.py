@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ def tiles() -> Parts[Tile]:
 def read_ply(data: bytes) -> np.ndarray:
     head, body = data.split(b"end_header\n", 1)
     count = int(head.split(b"element vertex ")[1].split()[0])
-    vertices = np.frombuffer(body, ply.VERTEX)
+    vertices = np.frombuffer(body, ply.COLOURED if b"red" in head else ply.VERTEX)
     assert len(vertices) == count
     return vertices
 
@@ -68,6 +69,23 @@ def test_the_map_is_the_thinned_union_of_the_tiles(tiles: Parts[Tile]) -> None:
     assert 0.99 * len(voxels) <= len(xyz) <= 1.01 * len(voxels)
     assert np.abs(xyz.min(axis=0) - everything.min(axis=0)).max() < 0.5
     assert np.abs(xyz.max(axis=0) - everything.max(axis=0)).max() < 0.5
+
+
+def test_the_map_has_colours_where_one_tile_has_some(tiles: Parts[Tile]) -> None:
+    blind = read_ply(overview(Settings(), tiles)[2].read("map.ply"))
+    assert "red" not in (blind.dtype.names or ())
+    parts = [(tuple(where.items()), tile) for where, tile in tiles.items()]
+    one = parts[1][1]
+    colour, views = np.zeros((len(one), 3), np.uint8), np.zeros(len(one), np.uint16)
+    colour[:], views[:] = (7, 80, 255), 2
+    parts[1] = (parts[1][0], replace(one, colour=colour, views=views))
+    _, _, files = overview(Settings(), Parts(parts))
+    found = read_ply(files.read("map.ply"))
+    assert np.array_equal(found[list(blind.dtype.names or ())], blind)
+    rgb = np.column_stack([found[name] for name in ("red", "green", "blue")])
+    seen = rgb.any(axis=1)
+    assert 0 < seen.sum() < len(seen) and (rgb[seen] == (7, 80, 255)).all()
+    assert b"red" not in files.read("removed.ply").split(b"end_header")[0]
 
 
 def test_a_map_as_fine_as_its_tiles_keeps_every_point(tiles: Parts[Tile]) -> None:
