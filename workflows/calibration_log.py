@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,6 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from scanloom.schemas.errors import InvalidInput, UsageError
-from scanloom.schemas.scans import Scan
 from scanloom.stages.calibrate.board import Board, read_board
 from scanloom.stages.calibrate.image import grey
 from scanloom.stages.calibrate.standstill import Standstill, StandstillSettings, Watch, standstills
@@ -37,6 +35,7 @@ from scanloom.stages.logs.records import (
 from scanloom.stages.logs.roles import assign_roles, no_lidar
 from scanloom.stages.logs.sweeps import CloudMessage, ScanMaker
 from scanloom.workflows.calibration_folder import CalibrationSession, PointCloud, Shown
+from scanloom.workflows.calibration_place import LogPlacement, Place
 
 SettingsT = TypeVar("SettingsT", bound=BaseModel)
 _SAMPLES = (1, 8, 32, 128)
@@ -50,29 +49,6 @@ class LogSettings:
     ingest: options.Settings = options.Settings()
     images: camera_options.Settings = camera_options.Settings()
     standstill: StandstillSettings = StandstillSettings()
-
-
-@dataclass(frozen=True)
-class LogPlacement:
-    """A board that stood still in a log."""
-
-    name: str
-    points: PointCloud
-    images: dict[str, bytes]
-    log: str
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        return tuple(self.images)
-
-    def cloud(self) -> PointCloud:
-        return self.points
-
-    def image(self, camera: str) -> bytes:
-        return self.images[camera]
-
-    def where(self, camera: str) -> str:
-        return f"{self.log}, camera {camera} at {self.name}"
 
 
 def read_log(path: Path, board: Path | None, settings: LogSettings) -> CalibrationSession:
@@ -192,7 +168,7 @@ class _Reading:
 
     def take(self, found: list[Standstill]) -> tuple[tuple[Shown, ...], dict[str, str]]:
         """Second pass: scans and images of every standstill; and those without scans, with the reason."""
-        places = [_Place(one) for one in found]
+        places = [Place(one) for one in found]
         cameras = {c.topic: c for c in self.cameras.usable}
 
         def clouds() -> Iterator[CloudMessage]:
@@ -253,46 +229,6 @@ class _Reading:
         offset_s = camera.given.clock_offset_s if camera.given is not None else 0.0
         stamp_ns = body.stamp_ns if by_header else body.receive_ns
         return stamp_ns + self.shift_ns[camera.topic] - round(offset_s * 1e9)
-
-
-@dataclass
-class _Place:
-    """What is kept of a standstill while a log goes by: what is nearest to its middle."""
-
-    still: Standstill
-    scans: list[tuple[int, int, Scan]] = field(default_factory=list)
-    """A heap, the farthest from the middle first."""
-    images: dict[str, tuple[int, AnyImage]] = field(default_factory=dict)
-
-    def note_scan(self, scan: Scan, settings: StandstillSettings) -> None:
-        margin_ns = round(1e9 * settings.margin_s)
-        first, last = int(scan.stamp_ns.min()), int(scan.stamp_ns.max())
-        if first < self.still.start_ns + margin_ns or last > self.still.end_ns - margin_ns:
-            return
-        gap = abs(scan.reference_ns - self.still.middle_ns)
-        heapq.heappush(self.scans, (-gap, scan.reference_ns, scan))
-        if len(self.scans) > settings.scans:
-            heapq.heappop(self.scans)
-
-    def note_image(self, camera: str, stamp_ns: int, body: AnyImage) -> None:
-        gap = abs(stamp_ns - self.still.middle_ns)
-        if camera not in self.still.corners or not self.still.start_ns <= stamp_ns <= self.still.end_ns:
-            return
-        if camera not in self.images or gap < self.images[camera][0]:
-            self.images[camera] = (gap, body)
-
-    def cloud(self) -> PointCloud:
-        scans = [scan for _, _, scan in sorted(self.scans, key=lambda entry: entry[1])]
-        points = np.concatenate([np.column_stack((s.x_m, s.y_m, s.z_m)) for s in scans]).astype(np.float64)
-        ring = np.concatenate([s.ring for s in scans]).astype(np.int64)
-        return PointCloud(
-            points,
-            np.concatenate([s.intensity for s in scans]).astype(np.float64),
-            ring if len(np.unique(ring)) > 1 else None,
-        )
-
-    def encoded(self) -> dict[str, bytes]:
-        return {camera: packed(body)[0].tobytes() for camera, (_, body) in self.images.items()}
 
 
 def _first_cloud(source: LogSource, lidar: str) -> tuple[str, int]:

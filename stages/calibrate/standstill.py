@@ -59,10 +59,17 @@ class Standstill:
     end_ns: int
     corners: dict[str, F8]
     """Pixels (n, 2) by camera."""
+    stamps_ns: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    """Of the images that show it, by camera."""
 
     @property
     def middle_ns(self) -> int:
         return (self.start_ns + self.end_ns) // 2
+
+    def image_ns(self, camera: str) -> int | None:
+        """Stamp of the image nearest to the middle; None where the camera saw nothing."""
+        stamps = self.stamps_ns.get(camera, ())
+        return min(stamps, key=lambda stamp: abs(stamp - self.middle_ns), default=None)
 
     @property
     def length_ns(self) -> int:
@@ -110,9 +117,12 @@ class Watch:
             and followed
             and apart_px(last.corners[self.camera], corners) < self.settings.still_px
         ):
-            self._runs[-1] = replace(last, end_ns=stamp_ns)
+            stamps = {self.camera: (*last.stamps_ns[self.camera], stamp_ns)}
+            self._runs[-1] = replace(last, end_ns=stamp_ns, stamps_ns=stamps)
         else:
-            self._runs.append(Standstill(stamp_ns, stamp_ns, {self.camera: corners}))
+            self._runs.append(
+                Standstill(stamp_ns, stamp_ns, {self.camera: corners}, {self.camera: (stamp_ns,)})
+            )
 
     def standstills(self) -> list[Standstill]:
         """Those that are long enough."""
@@ -146,7 +156,7 @@ def _together(a: Standstill, b: Standstill, settings: StandstillSettings) -> Sta
     start, end = max(a.start_ns, b.start_ns), min(a.end_ns, b.end_ns)
     if a.corners.keys() & b.corners.keys() or end - start < 0.5e9 * settings.still_s:
         return None
-    return Standstill(start, end, a.corners | b.corners)
+    return Standstill(start, end, a.corners | b.corners, a.stamps_ns | b.stamps_ns)
 
 
 def _same_place(a: Standstill, b: Standstill, limit_px: float) -> bool:

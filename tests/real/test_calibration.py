@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration import PUBLISHED_M, SPREAD_M
+from benchmarks.calibration_crossing import alone
 from scanloom.stages.calibrate.acceptance import together
 from scanloom.stages.calibrate.calibration import calibrate
 from scanloom.stages.calibrate.cloud import CloudSettings
+from scanloom.stages.calibrate.cloud.evidence import SENSOR
 from scanloom.stages.calibrate.settings import CalibrateSettings
 from scanloom.workflows.calibrate_rig import look
 from scanloom.workflows.calibration_folder import read_session
@@ -47,3 +49,11 @@ def test_believing_the_lidar_gives_the_published_place(looked):
     found = calibrate(looked.scene, CalibrateSettings(lidar="believed", halves=0))
     off = (found.estimate.T_lidar_camera["camera"][:3, 3] - PUBLISHED_M) / SPREAD_M
     assert (np.abs(off) < 2.0).all()
+
+
+def test_clouds_alone_say_that_the_beams_cross_before_the_axis(looked):
+    """No image takes part: board and print have known sizes."""
+    mean, sigma = alone(looked.scene)
+    crossing = SENSOR.index("crossing_m")
+    assert 0.02 < mean[crossing] < 0.042
+    assert mean[crossing] > 10 * sigma[crossing] > 0.0

@@ -18,7 +18,7 @@ SMALL = BoardSettings(
     cameras=1, placements=3, columns=720, width_px=480, height_px=360, beams=32, farthest_m=2.5
 )
 TIMING = Timing(held_s=1.2, carried_s=0.3, turn_s=0.2, image_s=0.3)
-WAITING = {"standstill": {"still_s": 0.8, "spacing_s": 0.3, "scans": 3}, "calibrate": {"halves": 0}}
+WAITING = {"standstill": {"still_s": 0.8, "spacing_s": 0.3, "scans": 2}, "calibrate": {"halves": 0}}
 
 
 @pytest.fixture(scope="module")

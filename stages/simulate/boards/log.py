@@ -36,6 +36,8 @@ from scanloom.stages.simulate.sweeping import Sweep
 _START_NS = 1_700_000_000_000_000_000
 _LIDAR_DELAY_NS, _IMAGE_DELAY_NS = 4_000_000, 31_000_000
 """From measurement to recorder."""
+_WHOLE = 1e-6
+"""A last turn or image that falls on the end of the log, but for rounding, is in it."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ def _entries(session: BoardSession, timing: Timing) -> Iterator[Entry]:
 
 
 def _turns(session: BoardSession, timing: Timing) -> Iterator[Entry]:
-    for n in range(int(duration_s(session, timing) / timing.turn_s)):
+    for n in range(int(duration_s(session, timing) / timing.turn_s + _WHOLE)):
         stamp_ns = _START_NS + round(n * timing.turn_s * 1e9)
         now = moment(session, timing, (n + 0.5) * timing.turn_s)
         cloud = session.cloud_at(now.stand, now.T_lidar_board, np.random.default_rng((session.seed, 76, n)))
@@ -149,7 +151,7 @@ class _Film:
 
 def _images(session: BoardSession, timing: Timing) -> Iterator[Entry]:
     film = _Film(session)
-    for n in range(int(duration_s(session, timing) / timing.image_s) + 1):
+    for n in range(int(duration_s(session, timing) / timing.image_s + _WHOLE) + 1):
         time_s = n * timing.image_s
         stamp_ns, now = _START_NS + round(time_s * 1e9), moment(session, timing, time_s)
         for index, camera in enumerate(session.given):

@@ -50,6 +50,8 @@ def test_a_board_that_is_carried_stands_twice(watch: Watch) -> None:
     found = watch.standstills()
     assert [(s.start_ns / S, s.end_ns / S) for s in found] == [(0.0, 2.0), (3.5, 5.5)]
     assert watch.images == watch.boards == 12
+    assert [s.image_ns("front") / S for s in found] == [1.0, 4.5]
+    assert found[0].image_ns("left") is None
     assert apart_px(found[0].corners["front"], found[1].corners["front"]) > 20
 
 

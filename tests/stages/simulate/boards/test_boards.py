@@ -10,9 +10,18 @@ import cv2
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from rosbags.highlevel import AnyReader
 
 from scanloom.stages.geometry.se3 import inverse, transform
-from scanloom.stages.simulate.boards import BoardSession, BoardSettings, board_session, write_session
+from scanloom.stages.simulate.boards import (
+    BoardSession,
+    BoardSettings,
+    Timing,
+    board_session,
+    write_log,
+    write_session,
+)
+from scanloom.stages.simulate.boards.log import duration_s, moment
 
 SMALL: dict[str, Any] = {"width_px": 640, "height_px": 480, "cameras": 2, "placements": 4, "columns": 900}
 
@@ -194,3 +203,33 @@ def test_sessions_at_the_limits_are_made(changes: dict[str, Any]) -> None:
     assert len(session.stands) == session.settings.placements
     assert len(session.given) == session.settings.cameras
     assert all(camera.T_lidar_camera is None for camera in session.given)
+
+
+def test_a_board_is_held_and_carried() -> None:
+    session, timing = _session(placements=3), Timing(held_s=2.0, carried_s=1.0)
+    assert duration_s(session, timing) == 8.0
+    there = [stand.T_lidar_board for stand in session.stands]
+    for time_s, k in ((0.0, 0), (1.99, 0), (3.0, 1), (4.99, 1), (6.0, 2), (7.99, 2), (9.0, 2)):
+        now = moment(session, timing, time_s)
+        assert now.held and now.stand == k
+        np.testing.assert_array_equal(now.T_lidar_board, there[k])
+    halfway = moment(session, timing, 2.5)
+    assert not halfway.held
+    apart = [np.linalg.norm((inverse(T) @ halfway.T_lidar_board)[:3, 3]) for T in there[:2]]
+    whole = np.linalg.norm((inverse(there[0]) @ there[1])[:3, 3])
+    assert apart[0] == pytest.approx(apart[1], rel=0.01) and 0.4 * whole < apart[0] < whole
+
+
+def test_a_log_is_the_same_again_and_read_by_others(tmp_path: Path) -> None:
+    small = {"placements": 1, "cameras": 1, "columns": 360, "width_px": 320, "height_px": 240}
+    timing = Timing(held_s=0.6, carried_s=0.3, turn_s=0.2, image_s=0.3)
+    for name in ("a", "b"):
+        write_log(_session(**small), tmp_path / name, timing, tmp_path / f"{name}.json")
+    files = [(tmp_path / name / "sample_0.mcap").read_bytes() for name in ("a", "b")]
+    assert files[0] == files[1]
+    with AnyReader([tmp_path / "a"]) as reader:
+        counts = {c.topic: c.msgcount for c in reader.connections}
+        stamps = [stamp for _, stamp, _ in reader.messages()]
+    assert counts == {"/lidar/points": 3, "/front/image_raw/compressed": 3, "/front/camera_info": 3}
+    assert stamps == sorted(stamps)
+    assert json.loads((tmp_path / "a.json").read_text())["cameras"][0]["name"] == "front"
