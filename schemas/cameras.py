@@ -74,13 +74,14 @@ class CameraAgreement(_Entry):
     """Images that were compared."""
     points: int = 0
     nid: float = float("nan")
-    """Normalised information distance of reflectance and grey as calibrated: 0 one tells the other, 1 they are unrelated."""
+    """Normalised information distance of steps in the scans and of grey as calibrated: 0 one tells the other, 1 they are
+    unrelated."""
     nid_best: float = float("nan")
     """The same where the camera fits best."""
     offset_deg: tuple[float, float, float] = (float("nan"),) * 3
     """Turn about the camera's own x, y, z that `T_lidar_camera` lacks: the camera fits best at T Exp(offset)."""
     std_deg: tuple[float, float, float] = (float("nan"),) * 3
-    """Of the offset, from its spread when parts of the images are left out."""
+    """Of the offset, from its spread when the images are drawn again, and what they share."""
     remark: str = ""
     """What was found, in a sentence."""
 

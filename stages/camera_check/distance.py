@@ -1,7 +1,8 @@
-"""Normalised information distance of reflectance and grey, for a camera turned a little.
+"""Normalised information distance of steps in scans and steps in images, for a camera turned a little.
 
 NID(X, Y) = 2 - (H(X) + H(Y)) / H(X, Y), from the joint histogram of both (Stewart, "Localisation using the appearance of
 prior structure", Oxford 2015): 0 where one tells the other, 1 where they are unrelated, whatever the relation is.
+Here X is what the scan says of two neighbouring rays (`steps.Kind`) and Y how much the grey differs between both.
 """
 
 from __future__ import annotations
@@ -11,13 +12,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from scanloom.schemas.cameras import CameraModel
+from scanloom.stages.camera_check.steps import Kind
 from scanloom.stages.camera_check.views import View
 from scanloom.stages.geometry.camera import project
+from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.se3 import F8, so3_exp
 
-BINS = 16
-BANDS = 6
-"""Of range: reflectances are ranked among points about as far, since few sensors correct their readings for it."""
+I8 = NDArray[np.int64]
+F4 = NDArray[np.float32]
+B1 = NDArray[np.bool_]
+BINS = 12
+"""Of differences of grey, the finer the smaller they are."""
 STEP_RAD = 1e-4
 
 
@@ -25,104 +31,143 @@ STEP_RAD = 1e-4
 class Scene:
     """All views of a camera, ready to be compared again and again."""
 
-    group: NDArray[np.int64]
-    """Which part of the session each point belongs to, from 0."""
+    group: I8
+    """Number of the view of each step."""
     groups: int
-    rank: NDArray[np.int64]
-    """Bin of each point's reflectance."""
+    kind: I8
+    across: I8
     pixel: F8
-    """(n, 2), as calibrated or as turned by `at`."""
+    """(2, n, 2) of both places of each step, as calibrated or as turned by `at`."""
     slope: F8
-    """(n, 2, 3): pixels per radian of turn about the camera's axes."""
-    corner: NDArray[np.int64]
-    """Where the image of each point begins in `grey`."""
-    width: NDArray[np.int64]
-    grey: NDArray[np.float32]
-    """All images one after the other, 0 to BINS - 1, so that each grey is as frequent in an image as any other."""
+    """(2, n, 2, 3): pixels per radian of turn about the camera's axes."""
+    width: int
+    height: int
+    """Of all images, px."""
+    grey: F4
+    """All images one after the other, 0 to 1, so that each grey is as frequent in an image as any other."""
 
     def histograms(self, turn_rad: F8) -> F8:
-        """Joint histograms (groups, reflectance, grey) for a camera turned by a small vector about its axes."""
-        uv = self.pixel + self.slope @ turn_rad
-        u, v = np.maximum(uv[:, 0], 0.0), np.maximum(uv[:, 1], 0.0)
-        column, row = u.astype(np.int64), v.astype(np.int64)
-        a, b = u - column, v - row
-        at = self.corner + row * self.width + column
-        above = self.grey[at] * (1 - a) + self.grey[at + 1] * a
-        below = self.grey[at + self.width] * (1 - a) + self.grey[at + self.width + 1] * a
-        value = above * (1 - b) + below * b
-        low = np.minimum(value.astype(np.int64), BINS - 2)
+        """Joint histograms (groups, across, kind, difference) for a camera turned by a small vector about its axes."""
+        counts = np.zeros((self.groups, 2, len(Kind), BINS))
+        turn = np.asarray(turn_rad, np.float64)
+        _count(
+            counts,
+            self.group,
+            self.across,
+            self.kind,
+            self.pixel,
+            self.slope,
+            turn,
+            self.grey,
+            self.width,
+            self.height,
+        )
+        return counts
+
+
+@kernel
+def _count(
+    counts: F8,
+    group: I8,
+    across: I8,
+    kind: I8,
+    pixel: F8,
+    slope: F8,
+    turn: F8,
+    grey: F4,
+    width: int,
+    height: int,
+) -> None:
+    """Add every step to two bins beside each other, by how near it is to each."""
+    for i in range(len(kind)):
+        first = group[i] * width * height
+        a = _grey(grey, first, width, pixel[0, i], slope[0, i], turn)
+        b = _grey(grey, first, width, pixel[1, i], slope[1, i], turn)
+        value = np.sqrt(abs(b - a)) * (BINS - 1)
+        low = min(int(value), BINS - 2)
         share = value - low
-        cell = (self.group * BINS + self.rank) * BINS + low
-        size = self.groups * BINS * BINS
-        counts = np.bincount(cell, 1.0 - share, size) + np.bincount(cell + 1, share, size)
-        return np.asarray(counts.reshape(self.groups, BINS, BINS))
+        counts[group[i], across[i], kind[i], low] += 1.0 - share
+        counts[group[i], across[i], kind[i], low + 1] += share
+
+
+@kernel
+def _grey(grey: F4, first: int, width: int, pixel: F8, slope: F8, turn: F8) -> float:
+    """Bilinear, at a pixel moved by a turn."""
+    u = max(pixel[0] + slope[0, 0] * turn[0] + slope[0, 1] * turn[1] + slope[0, 2] * turn[2], 0.0)
+    v = max(pixel[1] + slope[1, 0] * turn[0] + slope[1, 1] * turn[1] + slope[1, 2] * turn[2], 0.0)
+    column, row = int(u), int(v)
+    a, b = u - column, v - row
+    at = first + row * width + column
+    above = grey[at] * (1.0 - a) + grey[at + 1] * a
+    below = grey[at + width] * (1.0 - a) + grey[at + width + 1] * a
+    value: float = above * (1.0 - b) + below * b
+    return value
 
 
 def nid(joint: F8) -> F8:
-    """Distance of each joint histogram (..., BINS, BINS)."""
-    total = joint.sum(axis=(-2, -1))
+    """Distance of each joint histogram (..., across, kind, difference), given the direction: entropies are means over both,
+    since two rows of a scan lie farther apart than two columns."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        p = joint / total[..., None, None]
-        both = _entropy(p.reshape(*p.shape[:-2], -1))
-        return np.asarray(2.0 - (_entropy(p.sum(axis=-1)) + _entropy(p.sum(axis=-2))) / both)
+        both, kinds, steps = (
+            _entropy(x) for x in (joint.reshape(*joint.shape[:-2], -1), joint.sum(-1), joint.sum(-2))
+        )
+        return np.asarray(2.0 - (kinds + steps).sum(axis=-1) / both.sum(axis=-1))
 
 
-def _entropy(p: F8) -> F8:
-    return np.asarray(-np.where(p > 0, p * np.log(np.where(p > 0, p, 1.0)), 0.0).sum(axis=-1))
+def _entropy(counts: F8) -> F8:
+    """Of each histogram (..., cells), times what it counts."""
+    total = counts.sum(axis=-1)
+    logs = np.where(counts > 0, counts * np.log(np.where(counts > 0, counts, 1.0)), 0.0).sum(axis=-1)
+    return np.asarray(np.where(total > 0, total * np.log(np.where(total > 0, total, 1.0)), 0.0) - logs)
 
 
-def scene(views: list[View], group: list[int], *, blur_px: float, margin_rad: float, at: F8) -> Scene:
-    """Views about the turn `at` (radians about the camera's axes); points that a turn of `margin_rad` about each axis
-    could take out of the image are left out, so that the same points are compared whatever the turn."""
-    pictures = [_even(view.pixels, blur_px) for view in views]
-    corners = np.concatenate(([0], np.cumsum([picture.size for picture in pictures])))
-    parts = []
-    for n, view in enumerate(views):
-        pixel, slope = _linear(view, at)
-        inner = np.isfinite(pixel).all(axis=1) & np.isfinite(slope).all(axis=(1, 2))
-        size = np.array([view.model.width_px, view.model.height_px])
-        reach = margin_rad * np.abs(slope).sum(axis=2)
-        inner &= ((pixel > reach) & (pixel < size - 2 - reach)).all(axis=1)
-        far = np.linalg.norm(view.points[inner], axis=1)
-        parts.append((pixel[inner], slope[inner], view.intensity[inner], far, np.full(int(inner.sum()), n)))
-    pixel, slope, intensity, far, of = (np.concatenate(column) for column in zip(*parts, strict=True))
+def scene(views: list[View], grey: F4, *, margin_rad: float, at: F8, every: int = 1) -> Scene:
+    """Views of one camera, and their `greys`, about the turn `at` (radians about its axes), of all steps or `every` second, third, ...
+
+    Steps that a turn of `margin_rad` about each axis could take out of the image are left out, so that the same ones are
+    compared whatever the turn."""
+    model = views[0].model
+    places = [np.concatenate([getattr(view, end)[::every] for view in views]) for end in ("near", "beside")]
+    kind, across = (
+        np.concatenate([getattr(view, of)[::every] for view in views]) for of in ("kind", "across")
+    )
+    number = np.repeat(np.arange(len(views)), [len(view.kind[::every]) for view in views])
+    ends = [_linear(model, xyz, at) for xyz in places]
+    pixel, slope = np.stack([p for p, _ in ends]), np.stack([s for _, s in ends])
+    with np.errstate(invalid="ignore"):
+        reach = margin_rad * np.abs(slope).sum(axis=3)
+        size = np.array([model.width_px, model.height_px])
+        inner = ((pixel > reach) & (pixel < size - 2 - reach)).all(axis=(0, 2))
+    number = number[inner]
     return Scene(
-        group=np.array(group, np.int64)[of], groups=max(group) + 1, rank=ranks(intensity, far), pixel=pixel, slope=slope,
-        corner=corners[of], width=np.array([view.model.width_px for view in views], np.int64)[of],
-        grey=np.concatenate([picture.ravel() for picture in pictures]),
+        group=number.astype(np.int64), groups=len(views), kind=kind[inner], across=across[inner],
+        pixel=np.ascontiguousarray(pixel[:, inner]), slope=np.ascontiguousarray(slope[:, inner]),
+        width=model.width_px, height=model.height_px, grey=grey,
     )  # fmt: skip
 
 
-def _linear(view: View, at: F8) -> tuple[F8, F8]:
-    """Pixels (n, 2) after the turn `at`, and their derivatives (n, 2, 3) by a further one."""
-    turned = view.points @ so3_exp(at).T
-    pixel, seen = project(view.model, turned)
+def greys(views: list[View], blur_px: float) -> F4:
+    """All images one after the other, blurred, 0 to 1, each stretched so that its greys are evenly frequent."""
+    return np.concatenate([_even(view.pixels, blur_px).ravel() for view in views])
+
+
+def _linear(model: CameraModel, xyz: F8, at: F8) -> tuple[F8, F8]:
+    """Pixels (n, 2) of places after the turn `at`, and their derivatives (n, 2, 3) by a further one; NaN where not seen."""
+    turned = xyz @ so3_exp(at).T
+    pixel, seen = project(model, turned)
     slope = np.empty((len(pixel), 2, 3))
     for axis in range(3):
-        ahead = project(view.model, turned @ so3_exp(STEP_RAD * np.eye(3)[axis]).T)[0]
-        back = project(view.model, turned @ so3_exp(-STEP_RAD * np.eye(3)[axis]).T)[0]
-        slope[:, :, axis] = (ahead - back) / (2 * STEP_RAD)
+        ahead = project(model, turned @ so3_exp(STEP_RAD * np.eye(3)[axis]).T)[0]
+        slope[:, :, axis] = (ahead - pixel) / STEP_RAD
     pixel[~seen] = np.nan
     return pixel, slope
 
 
 def _even(pixels: NDArray[np.uint8], blur_px: float) -> NDArray[np.float32]:
-    """A picture blurred, and stretched so that its greys are evenly frequent, 0 to BINS - 1."""
+    """A picture stretched so that its greys are evenly frequent, 0 to 1, and blurred."""
     import cv2
 
-    soft = cv2.GaussianBlur(pixels, (0, 0), blur_px) if blur_px > 0 else pixels
-    share = np.cumsum(np.bincount(soft.ravel(), minlength=256)) / soft.size
+    share = np.cumsum(np.bincount(pixels.ravel(), minlength=256)) / pixels.size
     middle = share - 0.5 * np.diff(share, prepend=0.0)
-    return (middle * (BINS - 1)).astype(np.float32)[soft]
-
-
-def ranks(intensity: NDArray[np.float32], far: F8) -> NDArray[np.int64]:
-    """Reflectances (n,) as bins 0 to BINS - 1, each as full as any other, among points about as far."""
-    out = np.zeros(len(far), np.int64)
-    band = np.searchsorted(np.quantile(far, np.linspace(0, 1, BANDS + 1)[1:-1]), far) if len(far) else out
-    for n in range(BANDS):
-        rows = np.flatnonzero(band == n)
-        values, inverse, counts = np.unique(intensity[rows], return_inverse=True, return_counts=True)
-        middle = (np.cumsum(counts) - 0.5 * counts) / max(len(rows), 1)
-        out[rows] = (middle * BINS).astype(np.int64).clip(0, BINS - 1)[inverse] if len(values) else 0
-    return out
+    stretched = middle.astype(np.float32)[pixels]
+    return np.asarray(cv2.GaussianBlur(stretched, (0, 0), blur_px) if blur_px > 0 else stretched, np.float32)

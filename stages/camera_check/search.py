@@ -1,4 +1,5 @@
-"""The small turn at which a camera fits best, and how sure it is: from the images, and from all but a part of them."""
+"""The small turn at which a camera fits best, and how sure it is: from the images, and from some of them drawn again and
+again."""
 
 from __future__ import annotations
 
@@ -7,17 +8,23 @@ from itertools import product
 
 import numpy as np
 
-from scanloom.stages.camera_check.distance import nid, scene
+from scanloom.stages.camera_check.distance import B1, F4, Scene, greys, nid, scene
 from scanloom.stages.camera_check.views import View
 from scanloom.stages.geometry.se3 import F8
 
 WIDEST_RAD = np.radians(2.0)
-COARSE_STEPS = 9
+COARSE_STEPS = 11
 """Per axis (the two that move the whole picture alike), over twice the widest turn."""
-COARSE_BLUR_PX, FINE_BLUR_PX = 4.0, 1.5
-REACHES_RAD = tuple(np.radians(reach) for reach in (0.5, 0.35, 0.3))
+COARSE_EVERY = 3
+COARSE_BLUR_PX, FINE_BLUR_PX = 4.0, 1.0
+REACHES_RAD = tuple(np.radians(reach) for reach in (0.4, 0.25, 0.15, 0.15))
 """Half width of the neighbourhood in which the distance is taken for a paraboloid, step after step."""
 DESIGN = np.array(list(product((-1.0, 0.0, 1.0), repeat=3)))
+DRAWS, BLOCK = 100, 4
+"""Drawn sets of images; images in a row, that see much the same, are drawn together."""
+FLOOR_RAD = np.radians(0.04)
+"""What drawing cannot show: an error that all images share. Turns of cameras that stood still were off by so much."""
+SEED = 7
 
 
 @dataclass(frozen=True)
@@ -26,71 +33,97 @@ class Fit:
 
     turn_rad: F8
     std_rad: F8
+    """By drawing images again (Efron, Annals of Statistics 7, 1979), and the error they share."""
     nid: float
     nid_best: float
     gain_std: float
-    """How much better a turn is for images that had no part in finding it, over the standard deviation of that."""
+    """How much better than none a turn is for images that had no part in finding it, over the standard deviation of that."""
     points: int
 
 
-def best_turn(views: list[View], group: list[int]) -> Fit:
-    """Search coarsely with blurred images, then by paraboloids; the same in every other group of images alone and in the rest.
+def best_turn(views: list[View]) -> Fit:
+    """From the best of a coarse grid with blurred images, and from no turn at all, by paraboloids; the better of both.
 
-    The spread is that of leaving out one group after the other, or of the two halves where that is larger. The gain is
-    that of each group by the turn of the half it is not in.
+    The same is done with every other block of images alone and with the rest: where both halves find another turn, as they
+    do where images tell nothing, the scatter is that between them.
     """
-    halves = [[g % 2 == half for g in range(max(group) + 1)] for half in (0, 1)]
-    starts = _coarse(views, group, [[True] * (max(group) + 1), *halves])
-    turns = _found(views, group, starts[0])
-    turn, without = turns[0], turns[1:]
-    of_half = [
-        _found(*_only(views, group, half), start)[0] for half, start in zip(halves, starts[1:], strict=True)
-    ]
-    count = len(without)
-    jackknife = np.sqrt((count - 1) / count * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
-    std = np.maximum(jackknife, 0.5 * np.abs(of_half[0] - of_half[1]))
-    compared = scene(views, group, blur_px=FINE_BLUR_PX, margin_rad=WIDEST_RAD, at=np.zeros(3))
+    halves = [np.arange(len(views)) // BLOCK % 2 == half for half in (0, 1)]
+    parts = [np.ones(len(views), bool), *halves]
+    coarse, grey = _coarse(views, parts), greys(views, FINE_BLUR_PX)
+    turn, *apart = (
+        _found(*_only(views, grey, part), start) for part, start in zip(parts, coarse, strict=True)
+    )
+    drawn = _draws(len(views))
+    compared = scene(views, grey, margin_rad=WIDEST_RAD, at=np.zeros(3))
     before, after = compared.histograms(np.zeros(3)), compared.histograms(turn)
-    by_other = [compared.histograms(other) for other in reversed(of_half)]
-    gains = np.array([nid(before[g]) - nid(by_other[g % 2][g]) for g in range(count)])
-    gain = gains.mean() / max(gains.std(ddof=1) / np.sqrt(count), 1e-12)
-    whole, best = (float(nid(joint.sum(axis=0))) for joint in (before, after))
-    return Fit(turn, std, whole, best, float(gain), len(compared.rank))
+    by_other = np.where(
+        halves[0][:, None, None, None], *(compared.histograms(other) for other in apart[::-1])
+    )
+    gain = nid(_summed(drawn, before)) - nid(_summed(drawn, by_other))
+    near = scene(views, grey, margin_rad=WIDEST_RAD, at=turn)
+    scatter = _minima(near, REACHES_RAD[-1], drawn).std(axis=0, ddof=1)
+    scatter = np.maximum(scatter, 0.5 * np.abs(apart[0] - apart[1]))
+    return Fit(
+        turn, np.hypot(scatter, FLOOR_RAD), float(nid(before.sum(axis=0))), float(nid(after.sum(axis=0))),
+        float(gain.mean() / max(float(gain.std(ddof=1)), 1e-12)), len(compared.kind),
+    )  # fmt: skip
 
 
-def _coarse(views: list[View], group: list[int], parts: list[list[bool]]) -> list[F8]:
-    """The best of a grid of turns about x and y, for each choice of groups; about z nothing is tried yet."""
-    blurred = scene(views, group, blur_px=COARSE_BLUR_PX, margin_rad=WIDEST_RAD, at=np.zeros(3))
+def comparable(views: list[View]) -> int:
+    """Steps that stay in the image whatever the turn."""
+    return len(scene(views, np.empty(0, np.float32), margin_rad=WIDEST_RAD, at=np.zeros(3)).kind)
+
+
+def _draws(count: int) -> F8:
+    """(DRAWS, count): how often each image is drawn."""
+    blocks = -(-count // BLOCK)
+    often = np.random.default_rng(SEED).multinomial(blocks, np.full(blocks, 1.0 / blocks), DRAWS)
+    return np.asarray(np.repeat(often, BLOCK, axis=1)[:, :count].astype(float))
+
+
+def _summed(often: F8, joint: F8) -> F8:
+    """Histograms (sets, ...) of sets of images from those (images, ...) of each."""
+    return np.asarray(np.tensordot(often, joint, axes=(1, 0)))
+
+
+def _coarse(views: list[View], parts: list[B1]) -> list[F8]:
+    """The best of a grid of turns about x and y, for each choice of images; about z nothing is tried yet."""
+    grey = greys(views, COARSE_BLUR_PX)
+    blurred = scene(views, grey, margin_rad=WIDEST_RAD, at=np.zeros(3), every=COARSE_EVERY)
     steps = np.linspace(-WIDEST_RAD, WIDEST_RAD, COARSE_STEPS)
     turns = np.array([(x, y, 0.0) for x in steps for y in steps])
     joint = np.array([blurred.histograms(turn) for turn in turns])
     return [np.asarray(turns[int(np.argmin(nid(joint[:, part].sum(axis=1))))]) for part in parts]
 
 
-def _only(views: list[View], group: list[int], part: list[bool]) -> tuple[list[View], list[int]]:
-    """Views of some groups, and these groups numbered anew."""
-    number = np.cumsum(part) - 1
-    rows = [n for n, g in enumerate(group) if part[g]]
-    return [views[n] for n in rows], [int(number[group[n]]) for n in rows]
+def _only(views: list[View], grey: F4, part: B1) -> tuple[list[View], F4]:
+    """Some of the views, and their images."""
+    return [view for view, use in zip(views, part, strict=True) if use], grey.reshape(len(views), -1)[
+        part
+    ].ravel()
 
 
-def _found(views: list[View], group: list[int], start: F8) -> F8:
-    """Best turns (1 + groups, 3) from a start on: of all groups, then of all but each."""
-    turns = start[None]
+def _found(views: list[View], grey: F4, coarse: F8) -> F8:
+    """Best turn from a coarse one on, or from none where that ends better."""
+    near_none = float(np.abs(coarse).max()) <= REACHES_RAD[0]
+    ends = [_descended(views, grey, start) for start in ([] if near_none else [coarse]) + [np.zeros(3)]]
+    compared = scene(views, grey, margin_rad=WIDEST_RAD, at=np.zeros(3))
+    return ends[int(np.argmin([nid(compared.histograms(end).sum(axis=0)) for end in ends]))]
+
+
+def _descended(views: list[View], grey: F4, turn: F8) -> F8:
+    everything = np.ones((1, len(views)))
     for reach in REACHES_RAD:
-        turns = _refined(views, group, turns[0], reach)
-    return turns
+        near = scene(views, grey, margin_rad=WIDEST_RAD, at=turn)
+        turn = np.clip(turn + _minima(near, reach, everything)[0], -WIDEST_RAD, WIDEST_RAD)
+    return turn
 
 
-def _refined(views: list[View], group: list[int], at: F8, reach: float) -> F8:
-    """Minima (1 + groups, 3) of paraboloids about `at`."""
-    near = scene(views, group, blur_px=FINE_BLUR_PX, margin_rad=WIDEST_RAD, at=at)
+def _minima(near: Scene, reach: float, often: F8) -> F8:
+    """Minima (sets, 3) of paraboloids about where a scene is, for sets of its images."""
     offsets = DESIGN * reach
-    joint = np.array([near.histograms(offset) for offset in offsets])
-    total = joint.sum(axis=1)
-    values = np.column_stack((nid(total), *(nid(total - joint[:, g]) for g in range(near.groups))))
-    turns = at + np.array([_minimum(offsets, column, reach) for column in values.T])
-    return np.asarray(np.clip(turns, -WIDEST_RAD, WIDEST_RAD))
+    values = np.column_stack([nid(_summed(often, near.histograms(offset))) for offset in offsets])
+    return np.array([_minimum(offsets, row, reach) for row in values])
 
 
 def _minimum(offsets: F8, values: F8, reach: float) -> F8:

@@ -1,9 +1,9 @@
-"""Camera check: images held against the reflectance of the scans, without a target.
+"""Camera check: images held against the steps of reflectance and range in the scans, without a target.
 
-Points of what stands still are put into a few dozen images as the calibration says. Where a camera has been turned since, some
-small turn makes grey and reflectance tell more of each other. It is searched for, with the images left out part by
-part, and a camera is said to have moved when the turn is larger than a limit and clearly better for images that had no part in
-finding it.
+Neighbouring points of what stands still are put into a few dozen images as the calibration says. Where a camera has been
+turned since, some small turn makes the steps of grey and those of the scans tell more of each other. It is searched for, its
+scatter is found by drawing images again and from their halves, and a camera is said to have moved when the turn is larger than a limit, beyond
+doubt, and clearly better than none.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from scanloom.schemas.cameras import Agreement, Camera, CameraAgreement, CameraC
 from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import Deskewed, Labels
 from scanloom.schemas.trajectory import Odometry
-from scanloom.stages.camera_check.search import Fit, best_turn
+from scanloom.stages.camera_check.search import Fit, best_turn, comparable
 from scanloom.stages.camera_check.views import Footing, View, footing, moments, view
 
-VERSION = 1
-GROUPS = 8
-"""Parts of the session that are left out in turn."""
-LEAST_IMAGES, LEAST_POINTS = 8, 5000
+VERSION = 2
+LEAST_IMAGES, LEAST_POINTS = 8, 2000
+LEAST_GAIN_STD = 1.5
+"""Standard deviations by which a turn must fit images better than none that had no part in finding it."""
 
 
 class Settings(BaseModel):
@@ -36,17 +36,20 @@ class Settings(BaseModel):
         description="images of each camera that are looked at; 0 for no check, number",
     )
     scans: int = Field(
-        default=3, ge=1, le=50, description="scans around an image whose points are used, number"
+        default=1, ge=1, le=50, description="scans nearest in time to an image that are used, number"
     )
     points: int = Field(
-        default=4000, ge=100, le=1_000_000, description="points that are used of each image at most, number"
+        default=1200,
+        ge=100,
+        le=1_000_000,
+        description="pairs of neighbouring points that are used of each image at most, number",
     )
     moved_deg: float = Field(
         default=0.25, ge=0.01, le=2.0, description="turn from which on a camera has moved, deg"
     )
     sure: float = Field(
         default=3.0, ge=1.0, le=20.0,
-        description="standard deviations by which a turn must fit better, and be larger than nothing, to count",
+        description="standard deviations by which a turn must be larger than nothing to count",
     )  # fmt: skip
     doubt_deg: float = Field(
         default=0.12, ge=0.01, le=2.0,
@@ -68,7 +71,9 @@ def camera_check(
         return CameraCheck()
     ground = footing(deskewed, labels, odometry)
     found = [check_camera(settings, camera, images, ground) for camera in placed]
-    return CameraCheck(cameras=tuple(each.model_copy(update={"remark": _sentence(each)}) for each in found))
+    return CameraCheck(
+        cameras=tuple(each.model_copy(update={"remark": _sentence(settings, each)}) for each in found)
+    )
 
 
 def check_camera(
@@ -79,12 +84,12 @@ def check_camera(
     views: list[View] = []
     for _, part, number in moments(images, camera.name, settings.images):
         seen = view(camera, parts[part][number], ground, settings.scans, settings.points)
-        if seen is not None and len(seen.points):
+        if seen is not None and len(seen.kind):
             views.append(seen)
-    points = sum(len(seen.points) for seen in views)
+    points = comparable(views) if views else 0
     if len(views) < LEAST_IMAGES or points < LEAST_POINTS:
         return CameraAgreement(camera=camera.name, images=len(views), points=points)
-    fit = best_turn(views, [n * GROUPS // len(views) for n in range(len(views))])
+    fit = best_turn(views)
     # points move by the turn where the camera moved by its inverse
     offset, std = np.degrees(-fit.turn_rad), np.degrees(fit.std_rad)
     return CameraAgreement(
@@ -99,18 +104,30 @@ def judged(settings: Settings, fit: Fit) -> Agreement:
     size = float(np.degrees(np.linalg.norm(fit.turn_rad)))
     along = fit.turn_rad / max(float(np.linalg.norm(fit.turn_rad)), 1e-12)
     std = float(np.degrees(np.linalg.norm(fit.std_rad * along)))
-    clear = fit.gain_std > settings.sure and size > settings.sure * std
+    clear = fit.gain_std > LEAST_GAIN_STD and size > settings.sure * std
     if size > settings.moved_deg:
         return "moved" if clear else "unknown"
     return "agrees" if float(np.degrees(fit.std_rad).max()) < settings.doubt_deg else "unknown"
 
 
-def _sentence(found: CameraAgreement) -> str:
+def _sentence(settings: Settings, found: CameraAgreement) -> str:
     if found.verdict == "moved":
         return (
             f"Camera {found.camera} has turned by {found.turned_deg:.2f} deg since its calibration, by "
-            f"{found.images} images held against the reflectance: calibrate it again."
+            f"{found.images} images held against the scans: calibrate it again."
         )
     if found.verdict == "agrees":
         return f"Camera {found.camera} stands where its calibration says, to {found.turned_deg:.2f} deg."
-    return f"Whether camera {found.camera} stands where its calibration says cannot be told from {found.images} images."
+    return (
+        f"Whether camera {found.camera} stands where its calibration says cannot be told from {found.images} images: "
+        f"{_doubt(settings, found)}."
+    )
+
+
+def _doubt(settings: Settings, found: CameraAgreement) -> str:
+    """Why it cannot be told."""
+    if not np.isfinite(found.nid):
+        return f"{found.points} pairs of points were seen in them; {LEAST_IMAGES} images and {LEAST_POINTS} pairs are the least"
+    if found.turned_deg > settings.moved_deg:
+        return f"a turn of {found.turned_deg:.2f} deg would fit best, but not clearly better than none"
+    return f"its turn is known to {max(found.std_deg):.2f} deg only"

@@ -13,12 +13,14 @@ from scanloom.schemas.errors import StageError
 from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import Deskewed, Labels, PointClass
 from scanloom.schemas.trajectory import Odometry
+from scanloom.stages.camera_check.steps import Kind, steps
 from scanloom.stages.geometry.camera import project
 from scanloom.stages.geometry.interpolation import inside, interpolate_poses
 from scanloom.stages.geometry.pictures import decode, grey
 from scanloom.stages.geometry.se3 import F8, inverse, transform
 
 U1 = NDArray[np.uint8]
+I8 = NDArray[np.int64]
 WIDTH_PX = 640
 """Images are made smaller, to no less than this: half a degree stays several pixels."""
 NEAR_M, FAR_M = 2.0, 60.0
@@ -39,9 +41,12 @@ class View:
     """Grey (h, w), made smaller."""
     model: CameraModel
     """Of the smaller image."""
-    points: F8
-    """(n, 3) in the camera's axes as calibrated, m."""
-    intensity: NDArray[np.float32]
+    near: F8
+    """(n, 3) in the camera's axes as calibrated, m; where a step begins."""
+    beside: F8
+    """(n, 3): where it ends."""
+    kind: I8
+    across: I8
 
 
 @dataclass(frozen=True)
@@ -50,8 +55,8 @@ class Footing:
 
     deskewed: Sequence[Deskewed]
     labels: Sequence[Labels]
-    stamp_ns: NDArray[np.int64]
-    place: NDArray[np.int64]
+    stamp_ns: I8
+    place: I8
     """(n, 2): chunk and number in it, of each scan."""
     path: Odometry
 
@@ -90,14 +95,25 @@ def view(camera: Camera, image: Image, ground: Footing, scans: int, points: int)
         pixels, model = smaller(grey(decode(image)), camera.model)
     except StageError:
         return None
+    if pixels.shape != (model.height_px, model.width_px):
+        return None
     T_odom = interpolate_poses(ground.path.stamp_ns, ground.path.T_odom_lidar, _stamps(image.stamp_ns))[0]
-    clouds = [_standing(ground, k, inverse(T_odom)) for k in nearest]
-    xyz = np.concatenate([cloud for cloud, _ in clouds])
-    intensity = np.concatenate([values for _, values in clouds])
-    xyz = transform(inverse(np.array(camera.T_lidar_camera)), xyz)
-    rows = visible(model, xyz)
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), points)).astype(int)] if len(rows) else rows
-    return View(image.stamp_ns, pixels, model, xyz[rows], intensity[rows])
+    T = inverse(np.array(camera.T_lidar_camera)) @ inverse(T_odom)
+    seen = [_stepping(ground, k, T, model) for k in nearest]
+    near, beside, kind, across = (np.concatenate(column) for column in zip(*seen, strict=True))
+    rows = _balanced(kind, points)
+    return View(image.stamp_ns, pixels, model, near[rows], beside[rows], kind[rows], across[rows])
+
+
+def _balanced(kind: I8, count: int) -> I8:
+    """Rows of `count` steps at most, as many of them where nothing changes as where something does."""
+    even, other = np.flatnonzero(kind == Kind.EVEN), np.flatnonzero(kind != Kind.EVEN)
+    wanted = min(len(even), len(other), count // 2)
+    return np.sort(np.concatenate([_spread(rows, wanted) for rows in (even, other)]))
+
+
+def _spread(rows: I8, count: int) -> I8:
+    return rows[np.linspace(0, len(rows) - 1, min(len(rows), count)).astype(np.int64)] if len(rows) else rows
 
 
 def smaller(pixels: U1, model: CameraModel) -> tuple[U1, CameraModel]:
@@ -116,7 +132,7 @@ def smaller(pixels: U1, model: CameraModel) -> tuple[U1, CameraModel]:
     return np.asarray(small, np.uint8), model.model_copy(update=changes)
 
 
-def visible(model: CameraModel, xyz: F8) -> NDArray[np.int64]:
+def visible(model: CameraModel, xyz: F8) -> I8:
     """Rows of the points in the image that nothing nearer hides, as far as the points themselves tell."""
     pixels, seen = project(model, xyz)
     far = np.linalg.norm(xyz, axis=1)
@@ -132,7 +148,7 @@ def visible(model: CameraModel, xyz: F8) -> NDArray[np.int64]:
     return np.asarray(rows[far[rows] < BEHIND * around[v, u] + BEHIND_M], np.int64)
 
 
-def _nearest(ground: Footing, stamp_ns: int, scans: int) -> NDArray[np.int64]:
+def _nearest(ground: Footing, stamp_ns: int, scans: int) -> I8:
     """Scans of the same stretch of the path as the image; none where the path does not reach or is bridged."""
     path = ground.path
     if not len(ground.stamp_ns) or not inside(path.stamp_ns, _stamps(stamp_ns))[0]:
@@ -143,14 +159,16 @@ def _nearest(ground: Footing, stamp_ns: int, scans: int) -> NDArray[np.int64]:
     return np.asarray(order[: len(order) if whole else 0], np.int64)
 
 
-def _standing(ground: Footing, k: int, T_image_odom: F8) -> tuple[F8, NDArray[np.float32]]:
-    """Points of scan `k` that do not move, in the LiDAR's axes at the time of the image."""
+def _stepping(ground: Footing, k: int, T_camera_odom: F8, model: CameraModel) -> tuple[F8, F8, I8, I8]:
+    """Steps between points of scan `k` that do not move, in the camera's axes at the time of the image."""
     chunk, number = ground.place[k]
     scan, labels = ground.deskewed[chunk][number], ground.labels[chunk][number]
-    keep = np.isin(labels.class_, STANDING)
     at = interpolate_poses(ground.path.stamp_ns, ground.path.T_odom_lidar, _stamps(scan.reference_ns))[0]
-    return transform(T_image_odom @ at, scan.points()[keep].astype(float)), scan.intensity[keep]
+    found = steps(scan, np.isin(labels.class_, STANDING))
+    near, beside = (transform(T_camera_odom @ at, xyz) for xyz in (found.near, found.beside))
+    rows = visible(model, near)
+    return near[rows], beside[rows], found.kind[rows], found.across[rows]
 
 
-def _stamps(stamp_ns: int) -> NDArray[np.int64]:
+def _stamps(stamp_ns: int) -> I8:
     return np.array([stamp_ns], np.int64)

@@ -118,7 +118,7 @@ class Street:
 
     def scan(self, T_world_lidar: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         azimuth, elevation = np.meshgrid(
-            np.radians(np.arange(-60, 60, 0.4)), np.radians(np.linspace(-25, 10, 32))
+            np.radians(np.arange(-180, 180, 0.4)), np.radians(np.linspace(-25, 10, 32))
         )
         azimuth = azimuth + rng.uniform(0, np.radians(0.4))
         local = np.stack(
