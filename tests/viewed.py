@@ -106,7 +106,9 @@ def paint(folder: Path) -> None:
         x_m = table["x_m"].to_numpy() + across[tile]
         rgb = np.column_stack((np.clip(x_m * 8.0, 1, 255), np.zeros(len(x_m)), np.full(len(x_m), 255)))
         rgb = np.where(x_m[:, None] > 0.0, rgb, 0).astype(np.uint8)
-        colour = pa.FixedSizeListArray.from_arrays(pa.array(rgb.ravel()), 3)
+        field = table.schema.field("colour").type
+        assert str(field) == "fixed_size_binary[3]"
+        colour = pa.FixedSizeBinaryArray.from_buffers(field, len(rgb), [None, pa.py_buffer(rgb.tobytes())])
         painted = table.set_column(table.schema.get_field_index("colour"), "colour", colour)
         views = pa.array((x_m > 0.0).astype(np.uint16))
         painted = painted.set_column(painted.schema.get_field_index("views"), "views", views)

@@ -275,6 +275,10 @@ def _numpy(column: Any) -> NDArray[Any]:
         import pyarrow as pa
 
         array = pa.concat_arrays(array.chunks)
+    if str(array.type).startswith("fixed_size_binary"):
+        width = array.type.byte_width  # several bytes to a row
+        flat = np.frombuffer(array.buffers()[1], np.uint8, len(array) * width, array.offset * width)
+        return np.asarray(flat.reshape(len(array), width))
     if hasattr(array.type, "list_size"):
         flat = array.flatten().to_numpy(zero_copy_only=False)
         return np.asarray(flat.reshape(len(array), -1))
