@@ -25,7 +25,7 @@ PACKAGES = ("schemas", "stages", "pipeline", "workflows")
 BARE_SCANS = 12
 CHUNK_S = 2.0
 """Several chunks, so that what merges them is compiled, too."""
-CAMERA = {"cameras": 1, "camera_width_px": 160, "camera_height_px": 100, "camera_rate_hz": 1.0}
+CAMERA = {"cameras": 1, "camera_width_px": 160, "camera_height_px": 100, "camera_rate_hz": 2.0}
 """A few small images, for what only images ask for."""
 
 
