@@ -1,7 +1,8 @@
 """How numerics are compiled: numba without the GIL, with a cache that no stale code can poison.
 
 Numba notices a change of the file that holds a kernel, but not of a file it calls into. The cache folder is
-therefore named after the content of every module that holds kernels. Other modules say `from ... import kernel`.
+therefore named after the content of every module that holds kernels, and after where they lie: numba keeps what it compiled
+by the paths of files. Other modules say `from ... import kernel`.
 
 Numba itself is imported with the first call of a kernel: a command that only plans and waits never needs it.
 """
@@ -63,9 +64,9 @@ def _numba() -> Any:
 
 @functools.cache
 def cache_folder() -> Path:
-    """`$SCANLOOM_CACHE`, else the user's cache folder, then a name that changes with the code."""
+    """`$SCANLOOM_CACHE`, else the user's cache folder, then a name that changes with the code and its place."""
     stages = Path(__file__).resolve().parents[1]
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(bytes(stages))
     for module in sorted(stages.rglob("*.py")):
         source = module.read_bytes()
         if b"kernels import kernel" in source or module == Path(__file__).resolve():

@@ -40,6 +40,18 @@ def test_without_a_cache_nothing_is_loaded_and_nothing_breaks(tmp_path, monkeypa
     assert list(kernels.load_kernels()) == []
 
 
+def test_another_checkout_and_other_code_have_a_cache_of_their_own(tmp_path, monkeypatch):
+    folders = []
+    for place, code in (("a", "A = 1"), ("b", "A = 1"), ("a", "A = 2")):
+        module = tmp_path / place / "stages" / "geometry" / "kernels.py"
+        module.parent.mkdir(parents=True, exist_ok=True)
+        module.write_text(code)
+        monkeypatch.setattr(kernels, "__file__", str(module))
+        folders.append(kernels.cache_folder.__wrapped__())
+    assert len(set(folders)) == 3
+    assert folders[-1] == kernels.cache_folder.__wrapped__()
+
+
 def test_kernels_load_between_tasks_only():
     code = """
 import threading, time
