@@ -8,7 +8,7 @@ import os
 import queue
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, Protocol
 
 from scanloom.pipeline.forkserver import THREADS, start_forkserver
@@ -17,6 +17,7 @@ from scanloom.schemas.errors import ScanloomError, UsageError
 
 log = logging.getLogger(__name__)
 
+CLOSED_WITHIN_S = 10.0
 WORKERS_WITHIN_S = 60.0
 """How long to wait for the first worker of a cluster."""
 
@@ -167,12 +168,15 @@ class DaskExecutor:
             )
 
     def close(self) -> None:
-        with _quiet():
+        """A cluster that does not stop in time is left behind: what was made is in the store, and local processes end with
+        this one."""
+        with _quiet(), suppress(TimeoutError):
             for future in self._futures.values():
                 future.cancel()
-            self._client.close(timeout=5)
-            if self._cluster is not None:
-                self._cluster.close(timeout=5)
+        for part in (self._client, self._cluster):
+            if part is not None:
+                with _quiet(), suppress(TimeoutError):
+                    part.close(timeout=CLOSED_WITHIN_S)
 
 
 def worker_death(error: BaseException) -> str:

@@ -128,6 +128,23 @@ def test_a_cluster_that_loses_its_workers_fails_instead_of_waiting(tmp_path, sto
         executor.close()
 
 
+def test_a_cluster_that_does_not_stop_in_time_costs_no_result(tmp_path, store, monkeypatch):
+    """On a machine with too much to do closing takes longer than anybody waits."""
+    from distributed import Client
+
+    closed = []
+
+    def late(client, timeout):
+        closed.append(timeout)
+        close(client, timeout)
+        raise TimeoutError
+
+    close = Client.close
+    monkeypatch.setattr(Client, "close", late)
+    assert run(request(log(tmp_path, "a", A)), store, cluster="tests.pipeline.toys.clusters:threads").executed
+    assert closed == [cluster.CLOSED_WITHIN_S]
+
+
 def test_nothing_listens_beyond_this_machine():
     executor = cluster.executor("local", 1)
     try:
