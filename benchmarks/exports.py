@@ -201,9 +201,7 @@ def with_py3dtiles(python: Path, folder: Path, truth: Truth) -> Seen:
     script = Path(__file__).with_name("py3dtiles_reader.py")
     done = subprocess.run([python, "-I", script, folder], capture_output=True, text=True, check=True)
     found = json.loads(done.stdout)
-    box = truth.source.index
-    box = box.take(box.points > 0)  # a tile without points stays on the list
-    bounds = same(found["low"], found["high"], np.stack((box.min_m.min(axis=0), box.max_m.max(axis=0))))
+    bounds = same(found["low"], found["high"], truth.source.index.bounds_m)
     return Seen(f"py3dtiles ({found['files']} files)", found["points"], len(truth.projected), bounds, None)
 
 

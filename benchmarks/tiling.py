@@ -211,11 +211,11 @@ def _oversee(out: str) -> dict[str, Any]:
 
 
 def _header(name: str, index: TileIndex) -> dict[str, Any]:
-    bounds = {"min": index.min_m.min(axis=0).tolist(), "max": index.max_m.max(axis=0).tolist()}
+    low, high = index.bounds_m.tolist()
     return {
         "format": "scanloom map 1", "name": name, "version": 1, "parent": None, "frame": index.frame,
         "crs": index.georeference, "epsg": (index.georeference or {}).get("epsg"), "origin": index.georeference,
-        "bounds_m": bounds, "points": int(index.points.sum()), "tile_size_m": index.tile_size_m,
+        "bounds_m": {"min": low, "max": high}, "points": int(index.points.sum()), "tile_size_m": index.tile_size_m,
         "voxel_size_m": index.voxel_size_m, "sessions": [], "files": {},
     }  # fmt: skip
 

@@ -191,6 +191,19 @@ class TileIndex(Table):
         """The tiles, each once, in order."""
         return list(dict.fromkeys(str(name) for name in self.tile))
 
+    @property
+    def filled(self) -> TileIndex:
+        """Rows that have points; a tile without any stays on the list."""
+        return self.take(self.points > 0)
+
+    @property
+    def bounds_m(self) -> NDArray[np.float64]:
+        """Lowest and highest corner (2, 3) of all points, m; zeros where there is none."""
+        filled = self.filled
+        if not len(filled):
+            return np.zeros((2, 3))
+        return np.stack((filled.min_m.min(axis=0), filled.max_m.max(axis=0)))
+
     def by_tile(self) -> dict[str, slice]:
         """Rows of each tile."""
         starts = [i for i in range(len(self)) if i == 0 or self.tile[i] != self.tile[i - 1]]

@@ -223,10 +223,7 @@ def _description(result: Result, label: Label) -> dict[str, Any]:
         for name, s in _by_name(result)
         if name in mapped
     ]
-    filled = index.take(index.points > 0)
-    bounds = (
-        (filled.min_m.min(axis=0), filled.max_m.max(axis=0)) if len(filled) else (np.zeros(3), np.zeros(3))
-    )
+    low, high = index.bounds_m.tolist()
     return {
         "format": MAP_FORMAT,
         "name": label.name,
@@ -236,7 +233,7 @@ def _description(result: Result, label: Label) -> dict[str, Any]:
         "crs": index.georeference,
         "epsg": index.georeference["epsg"] if index.georeference else None,
         "origin": index.georeference,
-        "bounds_m": {"min": bounds[0].tolist(), "max": bounds[1].tolist()},
+        "bounds_m": {"min": low, "max": high},
         "points": int(index.points.sum()),
         "tile_size_m": index.tile_size_m,
         "voxel_size_m": index.voxel_size_m,

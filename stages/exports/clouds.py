@@ -100,7 +100,7 @@ def part_file(source: MapSource, name: str) -> Path:
 
 def part_boxes(source: MapSource, options: Options) -> dict[str, tuple[F8, F8]]:
     """Lowest and highest corner, in the map's frame, of the points of each of `part_names` that has any."""
-    index = source.index
+    index = source.index.filled
     boxes = {
         name: (index.min_m[rows].min(axis=0), index.max_m[rows].max(axis=0))
         for name, rows in index.by_tile().items()
@@ -151,7 +151,7 @@ def round_offset_m(source: MapSource, projector: Projector) -> F8:
 
     Whole hundreds of metres, so that single precision keeps a millimetre up to 8 km away.
     """
-    if len(source.index) == 0:
+    if not source.points:
         return np.zeros(3)
-    middle = (source.index.min_m.min(axis=0) + source.index.max_m.max(axis=0)) / 2.0
+    middle = source.index.bounds_m.mean(axis=0)
     return np.asarray(np.round(projector.project(middle)[0] / 100.0) * 100.0)

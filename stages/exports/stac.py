@@ -145,8 +145,7 @@ def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]
 
 def _corners(source: MapSource) -> F8:
     """The eight corners of every tile's bounds, (8 n, 3), in the map's frame."""
-    some = source.index.points > 0
-    low, high = source.index.min_m[some], source.index.max_m[some]
+    low, high = source.index.filled.min_m, source.index.filled.max_m
     picks = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T
     return np.concatenate([np.where(pick, high, low) for pick in picks])
 
