@@ -1,6 +1,7 @@
 """Colour against the simulator's truth: how far off, where there should be none, and how much of what was seen has some.
 
     python -m benchmarks.colour                                   drives of three seeds
+    python -m benchmarks.colour --sample --seeds                  the embedded sample, with three cameras
     python -m benchmarks.colour --seeds 7 --duration 60 --set margin_px=5 --json -
 
 Each drive is mapped by the workflow, with estimated poses; then `colour` is called as the map calls it, and every point of the map is
@@ -59,8 +60,8 @@ def main(words: Sequence[str] | None = None) -> None:
     """Everything the command line asks for."""
     options = _options(words)
     figures: list[Figure] = []
-    for seed in options.seeds:
-        for figure in _of_drive(seed, options):
+    for scope, chosen in _drives(options).items():
+        for figure in _of_drive(scope, chosen, options):
             console.print(
                 f"{figure.name:56} {figure.value:10.4g} {figure.unit:4} {figure.method}", highlight=False
             )
@@ -72,7 +73,10 @@ def _options(words: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3], help="of town, traffic and noise")
+    parser.add_argument("--seeds", type=int, nargs="*", default=[1, 2, 3], help="of town, traffic and noise")
+    parser.add_argument(
+        "--sample", action="store_true", help="the embedded sample as well, whole, with three cameras"
+    )
     parser.add_argument("--duration", type=float, default=25.0, help="length of a drive, s")
     parser.add_argument(
         "--simulate", action="append", default=[], metavar="NAME=VALUE", help="of the simulator"
@@ -90,12 +94,20 @@ def _given(words: Sequence[str]) -> dict[str, Any]:
     return {name: json.loads(value) for name, _, value in pairs}
 
 
-def _of_drive(seed: int, options: argparse.Namespace) -> Iterator[Figure]:
-    chosen: dict[str, Any] = {
-        "duration_s": options.duration, "beams": 32, "columns": 1024, "cameras": 3, "standstill_s": 1.0,
-        "seed": seed, "town_seed": seed, "parking_seed": seed,
-    } | _given(options.simulate)  # fmt: skip
-    result = produced(Drive("sample", f"town of seed {seed}", chosen), PRODUCTS, options.store)
+def _drives(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
+    """Settings of the simulator by the drive's name in the figures."""
+    given = _given(options.simulate)
+    drives: dict[str, dict[str, Any]] = {"sample": {"cameras": 3} | given} if options.sample else {}
+    for seed in options.seeds:
+        drives[f"seed_{seed}"] = {
+            "duration_s": options.duration, "beams": 32, "columns": 1024, "cameras": 3, "standstill_s": 1.0,
+            "seed": seed, "town_seed": seed, "parking_seed": seed,
+        } | given  # fmt: skip
+    return drives
+
+
+def _of_drive(scope: str, chosen: dict[str, Any], options: argparse.Namespace) -> Iterator[Figure]:
+    result = produced(Drive("sample", f"town, {scope}", chosen), PRODUCTS, options.store)
     begun = time.perf_counter()
     stretches = list(_painted(result, Settings(**_given(options.set))))
     paints = Parts(
@@ -117,8 +129,7 @@ def _of_drive(seed: int, options: argparse.Namespace) -> Iterator[Figure]:
     )
     if options.keep:
         options.keep.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(options.keep / f"{seed}.npz", **vars(truth), **found)
-    scope = f"seed_{seed}"
+        np.savez_compressed(options.keep / f"{scope}.npz", **vars(truth), **found)
     for name, value, unit, method in _scores(truth, found):
         yield Figure(f"{PREFIX}.{scope}.{name}", value, unit, scope, method)
     how = f"wall time of `colour` over {images} images, one process"

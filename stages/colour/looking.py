@@ -61,7 +61,7 @@ class Looker:
         local = transform(inverse(shot.T_world_camera), points)
         at, cosine, seen = visible(
             shot.camera.model, local, (normal @ shot.T_world_camera[:3, :3]).astype(np.float32),
-            self._surroundings.voxel_m, s.margin_px, s.tolerance_m,
+            self._surroundings.voxel_m, s.margin_px, s.tolerance_m, s.least_cosine,
         )  # fmt: skip
         away = np.linalg.norm(local[seen], axis=1)
         light, low, high = sampled(shot.pixels, at)

@@ -19,10 +19,16 @@ class Settings(BaseModel):
         description="an image taken so near to the camera's last one, and turned by less than 5 degrees, adds nothing, m",
     )  # fmt: skip
     tolerance_m: float = Field(
-        0.15, ge=0.01, le=5.0, description="what stands out of a point's surface by no more hides nothing, m"
+        0.1, ge=0.01, le=5.0, description="what stands out of a point's surface by no more hides nothing, m"
     )
     margin_px: float = Field(
-        3.0, ge=0.0, le=50.0, description="pixels beside the edge of something nearer that colour nothing, px"
+        2.0, ge=0.0, le=50.0, description="pixels beside the edge of something nearer that colour nothing, px"
+    )
+    least_cosine: float = Field(
+        0.05,
+        ge=0.0,
+        le=0.9,
+        description="a surface that is looked along, by a smaller cosine between ray and normal, or from behind, is not seen",
     )
     darkest: int = Field(6, ge=0, le=255, description="darker pixels of 8 bits say nothing of colour")
     brightest: int = Field(250, ge=1, le=255, description="brighter pixels are taken to be saturated")

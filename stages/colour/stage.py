@@ -28,7 +28,7 @@ from scanloom.stages.geometry.interpolation import inside, interpolate_poses
 from scanloom.stages.geometry.pictures import decode
 from scanloom.stages.geometry.se3 import F8, inverse, so3_log
 
-VERSION = 2
+VERSION = 3
 
 __all__ = ["VERSION", "Settings", "colour"]
 
