@@ -44,15 +44,14 @@ class Fit:
 def best_turn(views: list[View]) -> Fit:
     """From the best of a coarse grid with blurred images, and from no turn at all, by paraboloids; the better of both.
 
-    The same is done with every other block of images alone and with the rest: where both halves find another turn, as they
-    do where images tell nothing, the scatter is that between them.
+    The same is done with every other block of images alone and with the rest, also from the turn of all: where both halves
+    prefer another turn, as they do where images tell nothing, the scatter is that between them.
     """
     halves = [np.arange(len(views)) // BLOCK % 2 == half for half in (0, 1)]
     parts = [np.ones(len(views), bool), *halves]
-    coarse, grey = _coarse(views, parts), greys(views, FINE_BLUR_PX)
-    turn, *apart = (
-        _found(*_only(views, grey, part), start) for part, start in zip(parts, coarse, strict=True)
-    )
+    (start, *starts), grey = _coarse(views, parts), greys(views, FINE_BLUR_PX)
+    turn = _found(views, grey, start)
+    apart = [_found(*_only(views, grey, half), own, turn) for half, own in zip(halves, starts, strict=True)]
     drawn = _draws(len(views))
     compared = scene(views, grey, margin_rad=WIDEST_RAD, at=np.zeros(3))
     before, after = compared.histograms(np.zeros(3)), compared.histograms(turn)
@@ -103,17 +102,19 @@ def _only(views: list[View], grey: F4, part: B1) -> tuple[list[View], F4]:
     ].ravel()
 
 
-def _found(views: list[View], grey: F4, coarse: F8) -> F8:
-    """Best turn from a coarse one on, or from none where that ends better."""
+def _found(views: list[View], grey: F4, coarse: F8, fine: F8 | None = None) -> F8:
+    """Best turn from a coarse one on, or from none, or from a fine one, whichever ends best."""
     near_none = float(np.abs(coarse).max()) <= REACHES_RAD[0]
     ends = [_descended(views, grey, start) for start in ([] if near_none else [coarse]) + [np.zeros(3)]]
+    if fine is not None:
+        ends.append(_descended(views, grey, fine, REACHES_RAD[2:]))
     compared = scene(views, grey, margin_rad=WIDEST_RAD, at=np.zeros(3))
     return ends[int(np.argmin([nid(compared.histograms(end).sum(axis=0)) for end in ends]))]
 
 
-def _descended(views: list[View], grey: F4, turn: F8) -> F8:
+def _descended(views: list[View], grey: F4, turn: F8, reaches_rad: tuple[float, ...] = REACHES_RAD) -> F8:
     everything = np.ones((1, len(views)))
-    for reach in REACHES_RAD:
+    for reach in reaches_rad:
         near = scene(views, grey, margin_rad=WIDEST_RAD, at=turn)
         turn = np.clip(turn + _minima(near, reach, everything)[0], -WIDEST_RAD, WIDEST_RAD)
     return turn

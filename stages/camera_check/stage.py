@@ -18,7 +18,7 @@ from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.camera_check.search import Fit, best_turn, comparable
 from scanloom.stages.camera_check.views import Footing, View, footing, moments, view
 
-VERSION = 2
+VERSION = 3
 LEAST_IMAGES, LEAST_POINTS = 8, 2000
 LEAST_GAIN_STD = 1.5
 """Standard deviations by which a turn must fit images better than none that had no part in finding it."""
@@ -30,7 +30,7 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     images: int = Field(
-        default=40,
+        default=60,
         ge=0,
         le=1000,
         description="images of each camera that are looked at; 0 for no check, number",
@@ -100,14 +100,15 @@ def check_camera(
 
 
 def judged(settings: Settings, fit: Fit) -> Agreement:
-    """Moved: far enough, and beyond doubt. Agrees: not far, and known well enough to say so."""
+    """Moved: far enough, and beyond doubt. Agrees: not far, a standard deviation more included, and known well enough."""
     size = float(np.degrees(np.linalg.norm(fit.turn_rad)))
     along = fit.turn_rad / max(float(np.linalg.norm(fit.turn_rad)), 1e-12)
     std = float(np.degrees(np.linalg.norm(fit.std_rad * along)))
     clear = fit.gain_std > LEAST_GAIN_STD and size > settings.sure * std
     if size > settings.moved_deg:
         return "moved" if clear else "unknown"
-    return "agrees" if float(np.degrees(fit.std_rad).max()) < settings.doubt_deg else "unknown"
+    known = float(np.degrees(fit.std_rad).max()) < settings.doubt_deg
+    return "agrees" if known and size + std < settings.moved_deg else "unknown"
 
 
 def _sentence(settings: Settings, found: CameraAgreement) -> str:
@@ -130,4 +131,8 @@ def _doubt(settings: Settings, found: CameraAgreement) -> str:
         return f"{found.points} pairs of points were seen in them; {LEAST_IMAGES} images and {LEAST_POINTS} pairs are the least"
     if found.turned_deg > settings.moved_deg:
         return f"a turn of {found.turned_deg:.2f} deg would fit best, but not clearly better than none"
+    if max(found.std_deg) < settings.doubt_deg:
+        return (
+            f"its turn of {found.turned_deg:.2f} deg is too near to the limit of {settings.moved_deg:.2f} deg"
+        )
     return f"its turn is known to {max(found.std_deg):.2f} deg only"
