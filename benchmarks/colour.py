@@ -47,6 +47,8 @@ WORK = Path("build/bench")
 PREFIX = "bench.colour"
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 SURE, FULL = 0.99, 0.15
+BEYOND_M = 5.0
+"""What a camera shows from a little farther than colours are taken from it was seen all the same."""
 FITTED = {
     "one": "one factor for all light of the map, fitted to points in full light",
     "each": "one factor for each of red, green, blue, fitted to points in full light",
@@ -109,7 +111,8 @@ def _drives(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
 def _of_drive(scope: str, chosen: dict[str, Any], options: argparse.Namespace) -> Iterator[Figure]:
     result = produced(Drive("sample", f"town, {scope}", chosen), PRODUCTS, options.store)
     begun = time.perf_counter()
-    stretches = list(_painted(result, Settings(**_given(options.set))))
+    settings = Settings(**_given(options.set))
+    stretches = list(_painted(result, settings))
     paints = Parts(
         [
             ((("footage", f"{number:04d}"), ("tile", part.key)), part.product)
@@ -125,7 +128,11 @@ def _of_drive(scope: str, chosen: dict[str, Any], options: argparse.Namespace) -
     found = (
         _coloured(truth, colours)
         | {"seams": np.array(list(_seams(stretches)))}
-        | {"seen": world.seen(truth), "falling": world.falling(truth)}
+        | {
+            "seen": world.seen(truth, settings.reach_m),
+            "shown": world.seen(truth, settings.reach_m + BEYOND_M),
+        }
+        | {"falling": world.falling(truth)}
     )
     if options.keep:
         options.keep.mkdir(parents=True, exist_ok=True)
@@ -205,7 +212,7 @@ def _scores(truth: Known, found: dict[str, np.ndarray]) -> Iterator[tuple[str, f
         yield f"{name}_median", float(np.median(off)), "/255", f"median, {how}"
         yield f"{name}_p90", float(np.percentile(off, 90)), "/255", f"90th percentile, {how}"
     yield "factor", float(factors["one"]), "", "the one factor: what the light of the map is multiplied with"
-    yield from _presence(has, found["seen"])
+    yield from _presence(has, found["seen"], found["shown"])
     for number, seam in enumerate(found["seams"]):
         how = "how much brighter the next stretch is before `brightness` evens it out, median"
         yield f"seam_{number}", 100.0 * seam, "%", how
@@ -221,9 +228,10 @@ def _off(light: np.ndarray, target: np.ndarray) -> np.ndarray:
     return np.asarray(np.abs(srgb(light).astype(int) - srgb(target).astype(int)).mean(axis=1))
 
 
-def _presence(has: np.ndarray, seen: np.ndarray) -> Iterator[tuple[str, float, str, str]]:
-    """Colour where there should be some, and where there should be none."""
-    false = float((has & ~seen).sum())
+def _presence(has: np.ndarray, seen: np.ndarray, shown: np.ndarray) -> Iterator[tuple[str, float, str, str]]:
+    """Colour where there should be some, and where there should be none: `seen` from within reach, `shown` from a little beyond, too."""
+    false = float((has & ~shown).sum())
+    yield "false_points", false, "", "points with a colour that truly no camera saw"
     yield (
         "false_colour",
         100.0 * false / has.sum(),
@@ -232,7 +240,7 @@ def _presence(has: np.ndarray, seen: np.ndarray) -> Iterator[tuple[str, float, s
     )
     yield (
         "unseen_coloured",
-        100.0 * false / (~seen).sum(),
+        100.0 * false / (~shown).sum(),
         "%",
         "of the points that truly no camera saw, those with a colour",
     )
@@ -240,7 +248,7 @@ def _presence(has: np.ndarray, seen: np.ndarray) -> Iterator[tuple[str, float, s
         "coverage",
         100.0 * float((has & seen).sum() / seen.sum()),
         "%",
-        "of the points that a camera saw, those with a colour",
+        "of the points that a camera saw within reach, those with a colour",
     )
 
 

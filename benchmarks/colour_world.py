@@ -25,7 +25,6 @@ from scanloom.stages.simulate.town import build_town
 from scanloom.stages.simulate.traffic import build_traffic
 
 B1 = NDArray[np.bool_]
-REACH_M = 40.0
 BEHIND_M = 0.25
 """What is hit by so much nearer than a point hides it: points are noisy, and means of voxels."""
 OFF_SURFACE_M = 0.1
@@ -58,23 +57,27 @@ class World:
         light, _ = self._light.falling(above, points.normal, self._light.under_sky(above, points.normal))
         return light.astype(float)
 
-    def seen(self, points: Known) -> B1:
-        """Which of the points any image shows from at most `REACH_M`."""
+    def seen(self, points: Known, reach_m: float) -> B1:
+        """Which of the points any image shows from at most so far away."""
         seen = np.zeros(len(points.place), bool)
         for name, stamp_ns in self._shots:
             T = interpolate_poses(*self._truth, np.array([stamp_ns]))[0]
             rows = np.flatnonzero(~seen)
             rows = rows[
-                self._shown(self._cameras[name], T, stamp_ns, points.place[rows], points.normal[rows])
+                self._shown(
+                    self._cameras[name], T, stamp_ns, points.place[rows], points.normal[rows], reach_m
+                )
             ]
             seen[rows] = True
         return seen
 
-    def _shown(self, camera: Camera, T_world_lidar: F8, stamp_ns: int, places: F8, normals: F8) -> B1:
+    def _shown(
+        self, camera: Camera, T_world_lidar: F8, stamp_ns: int, places: F8, normals: F8, reach_m: float
+    ) -> B1:
         T = T_world_lidar @ np.array(camera.T_lidar_camera)
         origin = T[:3, 3]
         shown = np.zeros(len(places), bool)
-        near = np.flatnonzero(((places - origin) ** 2).sum(axis=1) < REACH_M**2)
+        near = np.flatnonzero(((places - origin) ** 2).sum(axis=1) < reach_m**2)
         near = near[project(camera.model, transform(inverse(T), places[near]))[1]]
         facing = np.sign(np.einsum("ni,ni->n", normals[near], origin - places[near]))
         off = OFF_SURFACE_M * facing[:, None] * normals[near]

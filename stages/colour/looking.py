@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanloom.schemas.cameras import Camera
+from scanloom.schemas.cameras import Camera, CameraModel
 from scanloom.schemas.objects import ObjectTracks
 from scanloom.schemas.trajectory import Poses
 from scanloom.stages.colour.exposure import RINGS
 from scanloom.stages.colour.light import sampled
 from scanloom.stages.colour.seeing import through_boxes, visible
 from scanloom.stages.colour.settings import Settings
-from scanloom.stages.colour.surroundings import Ground, Surroundings
+from scanloom.stages.colour.surroundings import Cone, Ground, Surroundings
 from scanloom.stages.colour.views import Views
+from scanloom.stages.geometry.camera import rays
 from scanloom.stages.geometry.interpolation import interpolate_poses
 from scanloom.stages.geometry.se3 import F8, inverse, pose, transform
 
@@ -25,6 +27,7 @@ OTHER_TIME_NS = 250_000_000
 """Boxes of what moves are of scans; one so far from an image in time says nothing of it."""
 CELLS_ACROSS, CELLS_DOWN = 32, 20
 """Of a picture, for what a camera always sees."""
+_EDGE_STEPS = 65
 
 
 @dataclass(frozen=True)
@@ -55,38 +58,39 @@ class Looker:
     def look(self, shot: Shot) -> Views | None:
         """What the image says of the points that it shows; None where it shows none."""
         s, origin = self._settings, shot.T_world_camera[:3, 3]
-        points, normal, number = self._around(origin)
+        points, normal, number = self._before(shot)
         if not len(points):
             return None
         local = transform(inverse(shot.T_world_camera), points)
-        at, cosine, seen = visible(
-            shot.camera.model, local, (normal @ shot.T_world_camera[:3, :3]).astype(np.float32),
-            self._surroundings.voxel_m, s.margin_px, s.tolerance_m, s.least_cosine,
-        )  # fmt: skip
-        away = np.linalg.norm(local[seen], axis=1)
-        light, low, high = sampled(shot.pixels, at)
+        turned = (normal @ shot.T_world_camera[:3, :3]).astype(np.float32)
+        seen = visible(s, shot.camera.model, local, turned, self._surroundings.voxel_m)
+        away = np.linalg.norm(local[seen.rows], axis=1)
+        light, low, high = sampled(shot.pixels, seen.pixels)
         good = (away >= s.nearest_m) & (low >= s.darkest) & (high <= s.brightest)
-        good &= ~through_boxes(origin, points[seen], *self._boxes(shot.stamp_ns))
+        good &= ~through_boxes(origin, points[seen.rows], *self._boxes(shot.stamp_ns))
         if not good.any():
             return None
-        weight = np.maximum(cosine, 0.05) / np.maximum(away / FULL_WEIGHT_M, 1.0) ** 2
+        weight = np.maximum(seen.cosine, 0.05) / np.maximum(away / FULL_WEIGHT_M, 1.0) ** 2
         count = int(good.sum())
         return Views(
-            point=number[seen[good]].astype(np.int32),
+            point=number[seen.rows[good]].astype(np.int32),
             image=np.full(count, shot.number, np.int32),
             camera=np.full(count, shot.camera_number, np.int32),
-            cell=cells_of(shot, at[good]),
-            ring=rings_of(shot, at[good]),
+            cell=cells_of(shot, seen.pixels[good]),
+            ring=rings_of(shot, seen.pixels[good]),
             away=away[good].astype(np.float32),
             light=np.log(np.maximum(light[good], 1e-5)).astype(np.float32),
             weight=weight[good].astype(np.float32),
+            surely=seen.surely[good],
         )
 
-    def _around(self, origin: F8) -> tuple[F8, NDArray[np.float32], NDArray[np.int64]]:
-        """Points (n, 3) within reach, their normals and numbers."""
+    def _before(self, shot: Shot) -> tuple[F8, NDArray[np.float32], NDArray[np.int64]]:
+        """Points (n, 3) that the image may show, their normals and numbers."""
+        T, reach_m = shot.T_world_camera, self._settings.reach_m
+        cone = Cone(T[:3, 3], T[:3, 2], widest_cosine(shot.camera.model), reach_m)
         points, normal, number = [np.empty((0, 3))], [np.empty((0, 3), np.float32)], [np.empty(0, np.int64)]
-        for name, ground in self._surroundings.near(origin, self._settings.reach_m):
-            rows = ground.near(origin, self._settings.reach_m)
+        for name, ground in self._surroundings.near(cone.tip, reach_m):
+            rows = ground.within(cone)
             points.append(ground.points[rows])
             normal.append(ground.normal[rows])
             number.append(self._number(name, ground) + rows)
@@ -109,6 +113,19 @@ class Looker:
         up = pose(np.tile(np.eye(3), (len(rows), 1, 1)), size * (0.0, 0.0, 0.5))
         grown = self._settings.moving_margin_m + tracks.speed_m_s[rows] * off_ns[rows] * 1e-9
         return T @ tracks.T_lidar_object[rows] @ up, 0.5 * size + grown[:, None]
+
+
+@lru_cache(maxsize=64)
+def widest_cosine(model: CameraModel) -> float:
+    """Cosine of an angle from the camera's axis beyond which no pixel looks: half a degree more than at the edge of its image."""
+    across = np.linspace(-0.5, model.width_px - 0.5, _EDGE_STEPS)
+    down = np.linspace(-0.5, model.height_px - 0.5, _EDGE_STEPS)
+    edge = [np.column_stack((across, np.full(_EDGE_STEPS, v))) for v in (down[0], down[-1])]
+    edge += [np.column_stack((np.full(_EDGE_STEPS, u), down)) for u in (across[0], across[-1])]
+    forward = rays(model, np.concatenate(edge))[:, 2]
+    if not np.isfinite(forward).all():
+        return -1.0
+    return float(np.cos(min(np.arccos(forward.min()) + np.radians(0.5), np.pi)))
 
 
 def cells_of(shot: Shot, pixels: F8) -> NDArray[np.int32]:

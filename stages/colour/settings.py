@@ -30,6 +30,16 @@ class Settings(BaseModel):
         le=0.9,
         description="a surface that is looked along, by a smaller cosine between ray and normal, or from behind, is not seen",
     )
+    bare_m: float = Field(
+        15.0, ge=0.0, le=200.0,
+        description="points without a surface (bushes, lone points) get no colour from farther than this, m",
+    )  # fmt: skip
+    alone: float = Field(
+        2.0,
+        ge=1.0,
+        le=10.0,
+        description="a point that one image alone shows is held to be seen only with so many times `least_cosine`, and so much less than `tolerance_m` before it; 1 asks no more of it",
+    )
     darkest: int = Field(6, ge=0, le=255, description="darker pixels of 8 bits say nothing of colour")
     brightest: int = Field(250, ge=1, le=255, description="brighter pixels are taken to be saturated")
     agree: float = Field(

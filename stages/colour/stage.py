@@ -2,7 +2,7 @@
 
 The map's own points say what hides what. Images are brought to one exposure, lenses freed of their fall-off and cameras of their tint by the
 points that several images show. Views that disagree with the others of their point (moving things, mirrors, edges, the own vehicle)
-count little or nothing. How bright a stretch is beside the others is left to `brightness`.
+count little or nothing; what one image alone shows has to be seen beyond doubt. How bright a stretch is beside the others is left to `brightness`.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from scanloom.stages.colour.looking import Looker, Shot
 from scanloom.stages.colour.own import on_own_vehicle
 from scanloom.stages.colour.settings import Settings
 from scanloom.stages.colour.surroundings import Surroundings
-from scanloom.stages.colour.views import F4, Gathered, Views, off_consensus
+from scanloom.stages.colour.views import F4, Gathered, Views, alone, off_consensus
 from scanloom.stages.geometry.interpolation import inside, interpolate_poses
 from scanloom.stages.geometry.pictures import decode
 from scanloom.stages.geometry.se3 import F8, inverse, so3_log
 
-VERSION = 3
+VERSION = 4
 
 __all__ = ["VERSION", "Settings", "colour"]
 
@@ -112,8 +112,10 @@ def _blended(settings: Settings, views: Views, images: int, cameras: int) -> tup
         views, light = views.take(~own), light[~own]
     agreement = np.exp(-0.5 * (off_consensus(views, light) / settings.agree) ** 2)
     kept = agreement > LEAST_AGREEMENT
-    views, weight = views.take(kept), (views.weight * agreement)[kept]
-    linear = np.exp(light[kept].astype(np.float64))
+    views, weight, light = views.take(kept), (views.weight * agreement)[kept], light[kept]
+    kept = views.surely | ~alone(views)
+    views, weight, light = views.take(kept), weight[kept], light[kept]
+    linear = np.exp(light.astype(np.float64))
     brightness = float(np.median(linear @ LUMINANCE)) if len(views) else 1.0
     return views, linear * (GREY / max(brightness, 1e-6)), weight
 

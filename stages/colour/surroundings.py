@@ -10,11 +10,25 @@ from numpy.typing import NDArray
 
 from scanloom.schemas.product import Parts
 from scanloom.schemas.tiles import RANK_SHIFT, Piece
+from scanloom.stages.geometry.kernels import kernel
 from scanloom.stages.geometry.normals import normals
 from scanloom.stages.geometry.se3 import F8
 
 STEP_X, STEP_Y = 1 << 29, 1 << 19
 """From one voxel to the next along x and y, in a piece's `voxel`."""
+
+
+@dataclass(frozen=True)
+class Cone:
+    """All an image can show, and a little more."""
+
+    tip: F8
+    """(3,) where the camera is, in the map's frame, m."""
+    axis: F8
+    """(3,) unit vector, where it looks."""
+    cosine: float
+    """Of the widest angle from the axis."""
+    reach_m: float
 
 
 @dataclass(frozen=True)
@@ -27,9 +41,19 @@ class Ground:
     normal: NDArray[np.float32]
     """(n, 3) unit normals; zeros where there is no surface."""
 
-    def near(self, place: F8, reach_m: float) -> NDArray[np.int64]:
-        """Rows of the points within a distance of a place (3,)."""
-        return np.flatnonzero(((self.points - place) ** 2).sum(axis=1) < reach_m**2)
+    def within(self, cone: Cone) -> NDArray[np.int64]:
+        """Rows of the points."""
+        return np.flatnonzero(_within(self.points, cone.tip, cone.axis, cone.cosine, cone.reach_m))
+
+
+@kernel
+def _within(points: F8, tip: F8, axis: F8, cosine: float, reach_m: float) -> NDArray[np.bool_]:
+    found = np.zeros(len(points), np.bool_)
+    for n in range(len(points)):
+        x, y, z = points[n, 0] - tip[0], points[n, 1] - tip[1], points[n, 2] - tip[2]
+        away = np.sqrt(x * x + y * y + z * z)
+        found[n] = away < reach_m and x * axis[0] + y * axis[1] + z * axis[2] >= cosine * away
+    return found
 
 
 class Surroundings:

@@ -35,6 +35,8 @@ class Views:
     light: F4
     """(n, 3) logarithm of linear red, green, blue."""
     weight: F4
+    surely: NDArray[np.bool_]
+    """Seen so clearly that no other image need agree."""
 
     def __len__(self) -> int:
         return len(self.point)
@@ -46,6 +48,12 @@ class Views:
     def starts(self) -> I8:
         """First view of each point that has any, and one past the last."""
         return np.append(np.flatnonzero(np.diff(self.point, prepend=-1)), len(self)).astype(np.int64)
+
+
+def alone(views: Views) -> NDArray[np.bool_]:
+    """Which views (n,) are the only one of their point."""
+    count = np.diff(views.starts)
+    return np.asarray(np.repeat(count == 1, count))
 
 
 class Gathered:

@@ -86,6 +86,21 @@ def test_images_are_brought_to_one_exposure() -> None:
     assert np.quantile(off, 0.95) <= 6
 
 
+def test_what_one_image_alone_shows_has_to_be_seen_surely() -> None:
+    """With these settings: by a cosine of 0.95 or more."""
+    doubt = {"least_cosine": 0.095, "alone": 10.0, "tolerance_m": 1.0}
+    one = tile(painted([image(picture())], path(1), **doubt))
+    aside = np.hypot(one.y_m - 25.0, one.z_m - 3.0)
+    wall = groups(one)["left"] | groups(one)["right"]
+    flatly = aside > 1.05 * np.tan(np.arccos(0.95)) * (WALL_X_M - START[0])
+    assert (wall & flatly).sum() > 300
+    assert not one.views[wall & flatly].any()
+    assert one.views[wall & (aside < 4.5)].all()
+    beside = picture(START + np.array((0.0, 0.5, 0.0)))
+    two = tile(painted([image(picture()), image(beside, 1)], path(2, step_m=0.5), **doubt))
+    assert (two.views[wall & flatly] == 2).mean() > 0.9
+
+
 def test_saturated_and_black_pixels_give_no_colour() -> None:
     bright, black = np.full((400, 640, 3), 251, np.uint8), np.full((400, 640, 3), 5, np.uint8)
     assert painted([image(bright)], path(1)) == []

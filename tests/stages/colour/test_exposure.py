@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from scanloom.stages.colour.exposure import RINGS, equalised
 from scanloom.stages.colour.looking import CELLS_ACROSS, CELLS_DOWN
 from scanloom.stages.colour.own import LEAST_IMAGES, on_own_vehicle
-from scanloom.stages.colour.views import Gathered, Views, off_consensus
+from scanloom.stages.colour.views import Gathered, Views, alone, off_consensus
 
 IMAGES, CAMERAS, POINTS = 12, 2, 1500
 
@@ -26,7 +28,9 @@ def views(seed: int = 0, wrong: float = 0.0) -> tuple[Views, np.ndarray]:
     light += rng.normal(0.0, 0.03, (n, 3))
     light[rng.random(n) < wrong] = 0.0
     numbers = (np.asarray(x, np.int32) for x in (point, image, camera, image * 0, ring))
-    made = Views(*numbers, away.astype(np.float32), light.astype(np.float32), np.ones(n, np.float32))
+    made = Views(
+        *numbers, away.astype(np.float32), light.astype(np.float32), np.ones(n, np.float32), np.zeros(n, bool)
+    )
     return made, paint[point]
 
 
@@ -49,9 +53,7 @@ def test_an_image_that_shares_nothing_is_taken_to_be_as_bright_as_the_others() -
     alone = seen.image == 5
     lonely = seen.point.copy()
     lonely[alone] = POINTS + np.arange(alone.sum())
-    parts = Views(
-        lonely, *(getattr(seen, f) for f in ("image", "camera", "cell", "ring", "away", "light", "weight"))
-    )
+    parts = replace(seen, point=lonely)
     gathered = Gathered()
     gathered.add(parts)
     ordered = gathered.ordered()
@@ -75,12 +77,12 @@ def test_off_is_the_largest_difference_to_the_weighted_median() -> None:
     light = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0, -3], [5, 5, 5]], np.float32)
     point = np.array([0, 0, 0, 1], np.int32)
     zeros = np.zeros(4, np.int32)
-    same = Views(point, zeros, zeros, zeros, zeros, np.ones(4, np.float32), light, np.ones(4, np.float32))
+    ones = np.ones(4, np.float32)
+    same = Views(point, zeros, zeros, zeros, zeros, ones, light, ones, np.zeros(4, bool))
     assert off_consensus(same, light) == pytest.approx([0.0, 0.1, 3.0, 0.0])
     heavy = np.array([1, 1, 100, 1], np.float32)
-    assert off_consensus(
-        Views(point, zeros, zeros, zeros, zeros, np.ones(4, np.float32), light, heavy), light
-    ) == pytest.approx([3.0, 3.0, 0.0, 0.0])
+    assert off_consensus(replace(same, weight=heavy), light) == pytest.approx([3.0, 3.0, 0.0, 0.0])
+    assert alone(same).tolist() == [False, False, False, True]
 
 
 def hood(images: int) -> tuple[Views, np.ndarray]:
@@ -95,7 +97,8 @@ def hood(images: int) -> tuple[Views, np.ndarray]:
     image[first] = (point[first] // 2) % images
     off = np.where(first, 1.0, 0.05).astype(np.float32)
     zeros, ones = np.zeros(len(point), np.int32), np.ones(len(point), np.float32)
-    return Views(point, image, zeros, cell, zeros, ones, np.zeros((len(point), 3), np.float32), ones), off
+    light = np.zeros((len(point), 3), np.float32)
+    return Views(point, image, zeros, cell, zeros, ones, light, ones, ones > 0), off
 
 
 def test_cells_that_always_disagree_show_the_own_vehicle() -> None:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from scanloom.stages.colour.seeing import visible
+from scanloom.stages.colour.seeing import Seen, visible
+from scanloom.stages.colour.settings import Settings
+from scanloom.stages.geometry.camera import rays
 from scanloom.stages.geometry.se3 import F8
 from tests.stages.colour.scene import MODEL
 
@@ -27,10 +30,14 @@ def car() -> F8:
     return np.column_stack((right, EYE_M - up, np.full(len(right), CAR_M)))
 
 
-def seen(points: F8, normal: F8, least_cosine: float = 0.03) -> np.ndarray:
+def looked(points: F8, normal: F8, **settings: float) -> Seen:
+    return visible(Settings(**settings), MODEL, points, normal.astype(np.float32), STEP_M)
+
+
+def seen(points: F8, normal: F8, least_cosine: float = 0.03, **settings: float) -> np.ndarray:
     """Which of the points (n, 3) the camera sees."""
     found = np.zeros(len(points), bool)
-    found[visible(MODEL, points, normal.astype(np.float32), STEP_M, 2.0, 0.12, least_cosine)[2]] = True
+    found[looked(points, normal, least_cosine=least_cosine, **settings).rows] = True
     return found
 
 
@@ -70,3 +77,43 @@ def test_a_surface_that_is_looked_along_too_flatly_is_not_seen() -> None:
     inside = (np.abs(road[:, 0]) < 2.0) & (road[:, 2] > 6.0)
     found = seen(road, normal, least_cosine=0.1)
     assert np.array_equal(found[inside], (cosine > 0.1)[inside])
+
+
+def test_a_point_without_a_surface_is_not_seen_from_afar() -> None:
+    away = np.array([14.9, 15.1])
+    points = np.column_stack((2.0 * np.arange(2.0) - 1.0, np.zeros(2), away))
+    points *= (away / np.linalg.norm(points, axis=1))[:, None]
+    assert seen(points, np.zeros((2, 3))).tolist() == [True, False]
+    assert seen(points, np.zeros((2, 3)), bare_m=15.2).all()
+    assert seen(points, np.tile((0.0, 0.0, -1.0), (2, 1))).all()
+
+
+@pytest.mark.parametrize("margin_px", [0.0, 2.0, 10.0])
+def test_nothing_is_seen_beside_the_edge_of_the_picture(margin_px: float) -> None:
+    model, inset = MODEL, margin_px + np.array([-0.01, 0.01])
+    left = np.column_stack((inset - 0.5, np.full(2, model.cy_px)))
+    right = np.column_stack((model.width_px - 0.5 - inset, np.full(2, model.cy_px)))
+    top = np.column_stack((np.full(2, model.cx_px), inset - 0.5))
+    bottom = np.column_stack((np.full(2, model.cx_px), model.height_px - 0.5 - inset))
+    for pixels in (left, right, top, bottom):
+        points = 10.0 * rays(model, pixels)
+        found = [seen(one[None], np.array([[0.0, 0.0, -1.0]]), margin_px=margin_px)[0] for one in points]
+        assert found == [False, True]
+
+
+def test_what_is_seen_barely_is_not_seen_surely() -> None:
+    road = ground()
+    cosine = EYE_M / np.linalg.norm(road, axis=1)
+    found = looked(road, np.tile((0.0, -1.0, 0.0), (len(road), 1)), least_cosine=0.06)
+    assert np.array_equal(found.surely, cosine[found.rows] >= 0.12)
+    assert 0.2 < found.surely.mean() < 0.9
+
+    wall = np.array([[0.0, 0.0, 10.0]])
+    for stands_out_m, seen_at_all, surely in ((0.04, True, True), (0.07, True, False), (0.13, False, False)):
+        before = wall - (0.0, 0.0, 1.0) * np.array(stands_out_m)
+        toward = np.array([0.0, 0.0, -1.0])
+        found = looked(
+            np.concatenate((wall, before)), np.tile(toward, (2, 1)), tolerance_m=0.1, alone=2.0, margin_px=0.0
+        )
+        assert (0 in found.rows) == seen_at_all
+        assert (0 in found.rows[found.surely]) == surely
