@@ -13,6 +13,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from benchmarks.calibration import DATA, PUBLISHED_M, SPREAD_M
 from benchmarks.scores import Figure
@@ -24,13 +25,16 @@ from scanloom.stages.calibrate.noise import Noise
 from scanloom.stages.calibrate.scene import Scene
 from scanloom.stages.calibrate.settings import CalibrateSettings
 from scanloom.stages.calibrate.view import Sensor, rows_of
-from scanloom.stages.geometry.se3 import F8
+from scanloom.stages.geometry.se3 import F8, so3_exp, transform
 from scanloom.workflows.calibrate_rig import look
 from scanloom.workflows.calibration_folder import read_session
 
 HELD_MM = (0, 10, 20, 30, 42)
 """42: the maker's table."""
 HALVES = 6
+SQUARES = (0.995, 1.005)
+HELD_SPREADS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
+"""Where the camera is held along x, from the published mean."""
 _CROSSING, _FARTHER = SENSOR.index("crossing_m"), SENSOR.index("farther_m")
 
 
@@ -47,7 +51,7 @@ def main() -> None:
         return
     scene = look(read_session(folder, None), CloudSettings()).scene
     figures = []
-    for figure in (*by_clouds(scene), *by_placements(scene)):
+    for figure in (*by_clouds(scene), *by_placements(scene), *by_place(scene)):
         figures.append(figure)
         print(
             f"{figure.scope:30} {figure.name:34} {figure.value:10.4f} {figure.unit:5} {figure.method}",
@@ -101,6 +105,9 @@ def by_placements(scene: Scene) -> Iterator[Figure]:
         "focal length free by 0.2 %": (replace(plain, lens_share=0.002), scene),
         "all of the LiDAR believed": (plain.believing(), scene),
     }
+    for share in SQUARES:
+        board = scene.board.model_copy(update={"square_m": share * scene.board.square_m})
+        ways[f"squares of {share:g} of their size"] = plain, replace(scene, board=board)
     for scope, (noise, seen) in ways.items():
         with patch.object(story, "_noise", lambda _, noise=noise: noise):
             found = story.calibrate(seen, CalibrateSettings(halves=0))
@@ -118,6 +125,38 @@ def by_placements(scene: Scene) -> Iterator[Figure]:
                 scope,
                 "from the published mean, in spreads",
             )
+
+
+def by_place(scene: Scene) -> Iterator[Figure]:
+    """How well the images can be explained at all with the camera held along x: boards where the clouds have them, all the rest free."""
+    for scope, noise in (("LiDAR estimated", Noise()), ("LiDAR believed", Noise().believing())):
+        with patch.object(story, "_noise", lambda _, noise=noise: noise):
+            found = story.calibrate(scene, CalibrateSettings(halves=0))
+        for spreads in HELD_SPREADS:
+            px = _held(found, PUBLISHED_M[0] + spreads * SPREAD_M[0])
+            how = (
+                f"{scope}, x held {spreads:g} spreads from the published mean, the rest fitted to all corners"
+            )
+            yield Figure("calibration.fitted_px", px, "px", f"{scope}, x {spreads:g} spreads", how)
+
+
+def _held(found: story.Found, x_m: float) -> float:
+    """Least rms of all corners, px, in the sample, with the camera's place along x held; by turns and the other two places."""
+    scene, camera = found.scene, found.scene.cameras[0]
+    T, bearings = found.estimate.T_lidar_camera[camera], found.scene.bearings()
+    boards = {p.name: found.estimate.board_by_cloud(p, found.noise) for p in scene.placements}
+
+    def errors(free: F8) -> F8:
+        R = T[:3, :3] @ so3_exp(free[:3])
+        place = np.array([x_m, *free[3:]])
+        seen = [
+            (bearings[p.name, camera], (transform(boards[p.name], scene.corners(p, camera)) - place) @ R)
+            for p in scene.placements
+        ]
+        return np.concatenate([b.errors(points)[0].ravel() for b, points in seen])
+
+    start = np.r_[np.zeros(3), T[1:3, 3]]
+    return float(np.sqrt(2.0 * np.mean(least_squares(errors, start).fun ** 2)))
 
 
 def crossed(scene: Scene, crossing_m: float) -> Scene:
