@@ -18,6 +18,7 @@ from scanloom.stages.geometry.camera import project
 from scanloom.stages.geometry.interpolation import inside, interpolate_poses
 from scanloom.stages.geometry.pictures import decode, grey
 from scanloom.stages.geometry.se3 import F8, inverse, transform
+from scanloom.stages.geometry.shutter import Sweep, as_met
 
 U1 = NDArray[np.uint8]
 I8 = NDArray[np.int64]
@@ -97,12 +98,20 @@ def view(camera: Camera, image: Image, ground: Footing, scans: int, points: int)
         return None
     if pixels.shape != (model.height_px, model.width_px):
         return None
-    T_odom = interpolate_poses(ground.path.stamp_ns, ground.path.T_odom_lidar, _stamps(image.stamp_ns))[0]
-    T = inverse(np.array(camera.T_lidar_camera)) @ inverse(T_odom)
-    seen = [_stepping(ground, k, T, model) for k in nearest]
+    T_odom_camera = _poses(camera, image, ground.path)
+    sweep = Sweep.between(*T_odom_camera) if camera.readout_s > 0.0 else None
+    seen = [_stepping(ground, k, inverse(T_odom_camera[1]), model, sweep) for k in nearest]
     near, beside, kind, across = (np.concatenate(column) for column in zip(*seen, strict=True))
     rows = _balanced(kind, points)
     return View(image.stamp_ns, pixels, model, near[rows], beside[rows], kind[rows], across[rows])
+
+
+def _poses(camera: Camera, image: Image, path: Odometry) -> F8:
+    """The camera (3, 4, 4) when its first, middle and last row were taken."""
+    half_ns = round(0.5e9 * camera.readout_s)
+    stamps = np.array([image.stamp_ns - half_ns, image.stamp_ns, image.stamp_ns + half_ns], np.int64)
+    found = interpolate_poses(path.stamp_ns, path.T_odom_lidar, stamps) @ np.array(camera.T_lidar_camera)
+    return np.asarray(found)
 
 
 def _balanced(kind: I8, count: int) -> I8:
@@ -159,13 +168,17 @@ def _nearest(ground: Footing, stamp_ns: int, scans: int) -> I8:
     return np.asarray(order[: len(order) if whole else 0], np.int64)
 
 
-def _stepping(ground: Footing, k: int, T_camera_odom: F8, model: CameraModel) -> tuple[F8, F8, I8, I8]:
+def _stepping(
+    ground: Footing, k: int, T_camera_odom: F8, model: CameraModel, sweep: Sweep | None
+) -> tuple[F8, F8, I8, I8]:
     """Steps between points of scan `k` that do not move, in the camera's axes at the time of the image."""
     chunk, number = ground.place[k]
     scan, labels = ground.deskewed[chunk][number], ground.labels[chunk][number]
     at = interpolate_poses(ground.path.stamp_ns, ground.path.T_odom_lidar, _stamps(scan.reference_ns))[0]
     found = steps(scan, np.isin(labels.class_, STANDING))
     near, beside = (transform(T_camera_odom @ at, xyz) for xyz in (found.near, found.beside))
+    if sweep is not None:
+        near, beside = (as_met(model, sweep, xyz) for xyz in (near, beside))
     rows = visible(model, near)
     return near[rows], beside[rows], found.kind[rows], found.across[rows]
 

@@ -20,6 +20,7 @@ from scanloom.stages.colour.views import Views
 from scanloom.stages.geometry.camera import rays
 from scanloom.stages.geometry.interpolation import interpolate_poses
 from scanloom.stages.geometry.se3 import F8, inverse, pose, transform
+from scanloom.stages.geometry.shutter import Sweep, as_met
 
 FULL_WEIGHT_M = 8.0
 """Beyond this distance a view counts less, by its square."""
@@ -39,7 +40,10 @@ class Shot:
     camera_number: int
     pixels: NDArray[np.uint8]
     T_world_camera: F8
+    """When its middle row was taken."""
     stamp_ns: int
+    sweep: Sweep | None = None
+    """Of a rolling shutter."""
 
 
 class Looker:
@@ -62,6 +66,8 @@ class Looker:
         if not len(points):
             return None
         local = transform(inverse(shot.T_world_camera), points)
+        if shot.sweep is not None:
+            local = as_met(shot.camera.model, shot.sweep, local)
         turned = (normal @ shot.T_world_camera[:3, :3]).astype(np.float32)
         seen = visible(s, shot.camera.model, local, turned, self._surroundings.voxel_m)
         away = np.linalg.norm(local[seen.rows], axis=1)
@@ -87,7 +93,8 @@ class Looker:
     def _before(self, shot: Shot) -> tuple[F8, NDArray[np.float32], NDArray[np.int64]]:
         """Points (n, 3) that the image may show, their normals and numbers."""
         T, reach_m = shot.T_world_camera, self._settings.reach_m
-        cone = Cone(T[:3, 3], T[:3, 2], widest_cosine(shot.camera.model), reach_m)
+        turned_rad = shot.sweep.turned_rad if shot.sweep is not None else 0.0
+        cone = Cone(T[:3, 3], T[:3, 2], widest_cosine(shot.camera.model, turned_rad), reach_m)
         points, normal, number = [np.empty((0, 3))], [np.empty((0, 3), np.float32)], [np.empty(0, np.int64)]
         for name, ground in self._surroundings.near(cone.tip, reach_m):
             rows = ground.within(cone)
@@ -115,17 +122,20 @@ class Looker:
         return T @ tracks.T_lidar_object[rows] @ up, 0.5 * size + grown[:, None]
 
 
+def widest_cosine(model: CameraModel, turned_rad: float = 0.0) -> float:
+    """Cosine of an angle from the camera's axis beyond which no pixel looks, were it turned by so much; half a degree to spare."""
+    return float(np.cos(min(_widest_rad(model) + turned_rad + np.radians(0.5), np.pi)))
+
+
 @lru_cache(maxsize=64)
-def widest_cosine(model: CameraModel) -> float:
-    """Cosine of an angle from the camera's axis beyond which no pixel looks: half a degree more than at the edge of its image."""
+def _widest_rad(model: CameraModel) -> float:
+    """At the edge of the image; pi where the lens's formula does not reach it."""
     across = np.linspace(-0.5, model.width_px - 0.5, _EDGE_STEPS)
     down = np.linspace(-0.5, model.height_px - 0.5, _EDGE_STEPS)
     edge = [np.column_stack((across, np.full(_EDGE_STEPS, v))) for v in (down[0], down[-1])]
     edge += [np.column_stack((np.full(_EDGE_STEPS, u), down)) for u in (across[0], across[-1])]
     forward = rays(model, np.concatenate(edge))[:, 2]
-    if not np.isfinite(forward).all():
-        return -1.0
-    return float(np.cos(min(np.arccos(forward.min()) + np.radians(0.5), np.pi)))
+    return float(np.arccos(forward.min())) if np.isfinite(forward).all() else np.pi
 
 
 def cells_of(shot: Shot, pixels: F8) -> NDArray[np.int32]:

@@ -27,6 +27,7 @@ from scanloom.stages.colour.views import F4, Gathered, Views, alone, off_consens
 from scanloom.stages.geometry.interpolation import inside, interpolate_poses
 from scanloom.stages.geometry.pictures import decode
 from scanloom.stages.geometry.se3 import F8, inverse, so3_log
+from scanloom.stages.geometry.shutter import Sweep
 
 VERSION = 4
 
@@ -81,7 +82,15 @@ def _shots(settings: Settings, images: Images, cameras: tuple[Camera, ...], pose
             continue
         if pixels.shape[:2] == (camera.model.height_px, camera.model.width_px):
             last[image.camera] = T
-            yield Shot(count, camera, numbers[image.camera], pixels, T, image.stamp_ns)
+            yield Shot(
+                count,
+                camera,
+                numbers[image.camera],
+                pixels,
+                T,
+                image.stamp_ns,
+                _sweep(image, camera, poses, T),
+            )
             count += 1
 
 
@@ -92,6 +101,18 @@ def _pose(image: Image, camera: Camera, poses: Poses) -> F8 | None:
         return None
     T = interpolate_poses(poses.stamp_ns, poses.T_world_lidar, at)[0] @ np.array(camera.T_lidar_camera)
     return T if np.isfinite(T).all() else None
+
+
+def _sweep(image: Image, camera: Camera, poses: Poses, T_world_camera: F8) -> Sweep | None:
+    """How the camera moved while the image was read; None for a global shutter."""
+    if camera.readout_s == 0.0:
+        return None
+    half_ns = round(0.5e9 * camera.readout_s)
+    ends = np.array([image.stamp_ns - half_ns, image.stamp_ns + half_ns], np.int64)
+    first, last = interpolate_poses(poses.stamp_ns, poses.T_world_lidar, ends) @ np.array(
+        camera.T_lidar_camera
+    )
+    return Sweep.between(first, T_world_camera, last)
 
 
 def _apart(settings: Settings, T: F8, before: F8 | None) -> bool:

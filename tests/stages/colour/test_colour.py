@@ -18,6 +18,7 @@ from tests.stages.colour.scene import (
     BOX_X_M,
     CAMERA,
     LEFT,
+    MODEL,
     RIGHT,
     START,
     WALL_X_M,
@@ -99,6 +100,32 @@ def test_what_one_image_alone_shows_has_to_be_seen_surely() -> None:
     beside = picture(START + np.array((0.0, 0.5, 0.0)))
     two = tile(painted([image(picture()), image(beside, 1)], path(2, step_m=0.5), **doubt))
     assert (two.views[wall & flatly] == 2).mean() > 0.9
+
+
+def rolled(origin: np.ndarray, speed_m_s: float, readout_s: float, bands: int = 50) -> np.ndarray:
+    """The picture of a camera that moves along y, its rows read one after another; `origin` is where it is in the middle."""
+    rows = np.array_split(np.arange(MODEL.height_px), bands)
+    middles = [readout_s * (band.mean() / (MODEL.height_px - 1) - 0.5) for band in rows]
+    moved = (picture(origin + np.array((0.0, speed_m_s * t, 0.0))) for t in middles)
+    return np.concatenate([one[band] for one, band in zip(moved, rows)])
+
+
+def test_rows_of_a_rolling_shutter_are_thrown_from_where_they_were_taken() -> None:
+    readout_s, poses = 0.08, path(3, step_m=2.0)
+    speed_m_s = 2.0 / ((poses.stamp_ns[1] - poses.stamp_ns[0]) * 1e-9)
+    shot = image(rolled(poses.T_world_lidar[1, :3, 3], speed_m_s, readout_s), 1)
+    rolling = CAMERA.model_copy(update={"readout_s": readout_s})
+    wrong = {}
+    for name, camera in (("rolling", rolling), ("global", CAMERA)):
+        made = tile(painted([shot], poses, camera=camera))
+        y, z = made.y_m - 25.0, made.z_m - 3.0
+        seam = (made.x_m > WALL_X_M - 0.5) & (np.abs(y) > 0.1) & (np.abs(y) < 0.7) & (np.abs(z) > 2.0)
+        seam &= made.views > 0
+        assert seam.sum() > 100
+        reddish = made.colour[seam, 0] > made.colour[seam, 2]
+        wrong[name] = np.mean(reddish != (y[seam] > 0))
+    assert wrong["rolling"] < 0.01
+    assert wrong["global"] > 0.2
 
 
 def test_saturated_and_black_pixels_give_no_colour() -> None:
