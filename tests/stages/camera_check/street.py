@@ -103,11 +103,16 @@ class Street:
         return np.where(mark, int(np.argmax(self.grey + self.nir)), kind)
 
     def image(self, T_world_camera: np.ndarray, model: CameraModel, rng: np.random.Generator) -> np.ndarray:
+        """From poses (k, 4, 4), of k bands of rows."""
         v, u = np.mgrid[: model.height_px, : model.width_px]
         local = rays(model, np.column_stack((u.ravel(), v.ravel())).astype(float))
-        directions = np.ascontiguousarray(local @ T_world_camera[:3, :3].T)
-        far, hit, face = cast(T_world_camera[:3, 3].copy(), directions, self.boxes)
-        points = T_world_camera[:3, 3] + directions * np.where(np.isfinite(far), far, 0.0)[:, None]
+        seen = []
+        for T, band in zip(T_world_camera, np.array_split(np.arange(model.height_px), len(T_world_camera))):
+            directions = local[np.isin(v.ravel(), band)] @ T[:3, :3].T
+            far, hit, face = cast(T[:3, 3].copy(), np.ascontiguousarray(directions), self.boxes)
+            points = T[:3, 3] + directions * np.where(np.isfinite(far), far, 0.0)[:, None]
+            seen.append((points, hit, face))
+        points, hit, face = (np.concatenate(column) for column in zip(*seen))
         light = np.array([0.75, 0.5, 1.0])[face]
         shade = 1 - 0.5 * (
             (np.sin(points[:, 0] * 0.9 + self.seed) + np.sin(points[:, 1] * 1.3) > 0.9) & (hit == -1)
@@ -144,8 +149,11 @@ class Recorded:
     odometry: Odometry
 
 
-def record(street: Street, images: int = 24, scans: int = 3, step_m: float = 4.0) -> Recorded:
+def record(
+    street: Street, images: int = 24, scans: int = 3, step_m: float = 4.0, readout_s: float = 0.0
+) -> Recorded:
     """A drive along the street with an image every `step_m`, `scans` scans around each, in two chunks and two parts."""
+    bands = np.linspace(-0.5, 0.5, 30) if readout_s > 0 else np.zeros(1)
     rng = np.random.default_rng([street.seed, 2])
     pictures, clouds, stamps, poses = [], [], [], []
     for n in range(images):
@@ -167,7 +175,8 @@ def record(street: Street, images: int = 24, scans: int = 3, step_m: float = 4.0
             )
             stamps.append(ns)
             poses.append(T)
-        seen = street.image(path(at_ns + 20_000_000, step_m) @ T_LIDAR_CAMERA, MODEL, rng)
+        times = at_ns + 20_000_000 + (1e9 * readout_s * bands).astype(np.int64)
+        seen = street.image(np.stack([path(int(t), step_m) for t in times]) @ T_LIDAR_CAMERA, MODEL, rng)
         data = np.asarray(cv2.imencode(".png", seen)[1], np.uint8).reshape(-1)
         pictures.append(
             Image(data=data, stamp_ns=at_ns + 20_000_000, camera="front", encoding="png", topic="/front")

@@ -48,6 +48,18 @@ def test_an_untouched_camera_agrees(recorded: Recorded) -> None:
     assert check(recorded) == found
 
 
+def test_rows_of_a_rolling_shutter_are_compared_where_they_were_taken() -> None:
+    rolling = record(Street(3), images=16, readout_s=0.08)
+    found = {}
+    for readout_s in (0.0, 0.08):
+        camera = mounted().model_copy(update={"readout_s": readout_s})
+        (found[readout_s],) = camera_check(
+            SETTINGS, rolling.images, Cameras(cameras=(camera,)), rolling.deskewed, rolling.labels, rolling.odometry
+        ).cameras  # fmt: skip
+    assert found[0.08].verdict == "agrees" and found[0.08].turned_deg < 0.15
+    assert found[0.08].nid < found[0.0].nid - 0.01
+
+
 @pytest.mark.parametrize("turn", [(0.5, 0.0, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 0.5), (-0.8, 1.2, 0.4)])
 def test_a_turned_camera_is_found_and_measured(turn: tuple[float, float, float], recorded: Recorded) -> None:
     found = check(recorded, turn)

@@ -125,7 +125,7 @@ def test_rows_of_a_rolling_shutter_are_thrown_from_where_they_were_taken() -> No
         reddish = made.colour[seam, 0] > made.colour[seam, 2]
         wrong[name] = np.mean(reddish != (y[seam] > 0))
     assert wrong["rolling"] < 0.01
-    assert wrong["global"] > 0.2
+    assert 0.08 < wrong["global"] < 0.5
 
 
 def test_saturated_and_black_pixels_give_no_colour() -> None:
