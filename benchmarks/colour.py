@@ -112,7 +112,7 @@ def _of_drive(scope: str, chosen: dict[str, Any], options: argparse.Namespace) -
     result = produced(Drive("sample", f"town, {scope}", chosen), PRODUCTS, options.store)
     begun = time.perf_counter()
     settings = Settings(**_given(options.set))
-    stretches = list(_painted(result, settings))
+    stretches = list(_painted(result, settings, Simulate(**chosen).readout_s))
     paints = Parts(
         [
             ((("footage", f"{number:04d}"), ("tile", part.key)), part.product)
@@ -143,9 +143,11 @@ def _of_drive(scope: str, chosen: dict[str, Any], options: argparse.Namespace) -
     yield Figure(f"{PREFIX}.{scope}.s_per_image", spent_s / images, "s", scope, how)
 
 
-def _painted(result: Result, settings: Settings) -> Iterator[list[Any]]:
-    """What each stretch of images adds."""
+def _painted(result: Result, settings: Settings, readout_s: float) -> Iterator[list[Any]]:
+    """What each stretch of images adds. Of a rolling shutter a log says nothing: a session file does, and so does this."""
     cameras, poses, tracks = (result.parts(product)[0] for product in (Cameras, Poses, ObjectTracks))
+    rig = tuple(camera.model_copy(update={"readout_s": readout_s}) for camera in cameras.cameras)
+    cameras = cameras.model_copy(update={"cameras": rig})
     pieces = result.parts(Piece)
     for images in result.parts(Images):
         yield list(colour(settings, images, cameras, poses, tracks, pieces))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +33,19 @@ BEHIND_M = 0.25
 OFF_SURFACE_M = 0.1
 """A point is seen as well where its surface is seen so far in front of it."""
 FAR_M = 60.0
+BANDS = 10
+"""Of a rolling shutter's image."""
+
+
+@dataclass(frozen=True)
+class Band:
+    """Rows of an image, and where the LiDAR was when they were read."""
+
+    camera: Camera
+    stamp_ns: int
+    T_world_lidar: F8
+    first_row: float
+    last_row: float
 
 
 class World:
@@ -61,29 +77,33 @@ class World:
         """Which of the points any image shows from at most so far away."""
         seen = np.zeros(len(points.place), bool)
         for name, stamp_ns in self._shots:
-            T = interpolate_poses(*self._truth, np.array([stamp_ns]))[0]
-            rows = np.flatnonzero(~seen)
-            rows = rows[
-                self._shown(
-                    self._cameras[name], T, stamp_ns, points.place[rows], points.normal[rows], reach_m
-                )
-            ]
-            seen[rows] = True
+            for band in self._bands(self._cameras[name], stamp_ns):
+                rows = np.flatnonzero(~seen)
+                seen[rows] = self._shown(band, points.place[rows], points.normal[rows], reach_m)
         return seen
 
-    def _shown(
-        self, camera: Camera, T_world_lidar: F8, stamp_ns: int, places: F8, normals: F8, reach_m: float
-    ) -> B1:
-        T = T_world_lidar @ np.array(camera.T_lidar_camera)
+    def _bands(self, camera: Camera, stamp_ns: int) -> Iterator[Band]:
+        """Rows that are read at about one time; all of them by a global shutter."""
+        count = BANDS if camera.readout_s > 0 else 1
+        edges = np.linspace(0.0, camera.model.height_px, count + 1) - 0.5
+        for first, last in pairwise(edges):
+            share = (first + last) / 2 / max(camera.model.height_px - 1, 1) - 0.5
+            at_ns = stamp_ns + round(1e9 * camera.readout_s * share)
+            T_world_lidar = interpolate_poses(*self._truth, np.array([at_ns]))[0]
+            yield Band(camera, at_ns, T_world_lidar, first, last)
+
+    def _shown(self, band: Band, places: F8, normals: F8, reach_m: float) -> B1:
+        T = band.T_world_lidar @ np.array(band.camera.T_lidar_camera)
         origin = T[:3, 3]
         shown = np.zeros(len(places), bool)
         near = np.flatnonzero(((places - origin) ** 2).sum(axis=1) < reach_m**2)
-        near = near[project(camera.model, transform(inverse(T), places[near]))[1]]
+        pixels, inside = project(band.camera.model, transform(inverse(T), places[near]))
+        near = near[inside & (pixels[:, 1] >= band.first_row) & (pixels[:, 1] < band.last_row)]
         facing = np.sign(np.einsum("ni,ni->n", normals[near], origin - places[near]))
         off = OFF_SURFACE_M * facing[:, None] * normals[near]
         for targets in (places[near], places[near] + off):
             left = ~shown[near]
-            shown[near[left]] = self._free(origin, targets[left], T_world_lidar, stamp_ns)
+            shown[near[left]] = self._free(origin, targets[left], band.T_world_lidar, band.stamp_ns)
         return shown
 
     def _free(self, origin: F8, targets: F8, T_world_lidar: F8, stamp_ns: int) -> B1:

@@ -98,7 +98,13 @@ _ROWS: tuple[Format, ...] = (
     ),
     Format("dem", "heights of the ground as GeoTIFF", write_dem, "raster", ("rasterio",)),
     Format(
-        "orthophoto", "intensity from above as GeoTIFF", write_orthophoto, "raster", ("rasterio",), passes=2
+        "orthophoto",
+        "intensity and colour from above as GeoTIFF",
+        write_orthophoto,
+        "raster",
+        ("rasterio",),
+        passes=2,
+        version=2,
     ),
     Format(
         "stac",

@@ -32,6 +32,8 @@ class Layer:
     tags: Mapping[str, str] = field(default_factory=dict)
     smooth: bool = True
     """Overviews hold means; else one of the cells."""
+    picture: bool = False
+    """Red, green, blue and alpha (4, rows, columns) instead of one band; where alpha is 0 there is nothing, `nodata` is not used."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,8 @@ def write_geotiffs(
     layers: list[Layer],
     values: Callable[[Window], list[NDArray[Any]] | None],
 ) -> list[Path]:
-    """One file per layer. `values` gives the layers' cells in a window, None where all of them are empty.
+    """One file per layer. `values` gives the layers' cells in a window, (rows, columns) or of a picture (4, rows, columns); None where
+    all of them are empty.
 
     First a plain file with the tiles that hold something, then GDAL's COG driver makes the overviews and the order
     that can be read over a network; both work tile by tile.
@@ -107,21 +110,32 @@ def _write_drafts(
                 continue
             row, column, rows, columns = window
             for file, layer, band in zip(files, layers, cells, strict=True):
-                file.write(np.asarray(band, layer.dtype), 1, window=Part(column, row, columns, rows))
+                bands = np.asarray(band, layer.dtype).reshape(-1, rows, columns)
+                file.write(bands, window=Part(column, row, columns, rows))
 
 
 def _draft(path: Path, lattice: Lattice, layer: Layer) -> Any:
     import rasterio
     from affine import Affine
+    from rasterio.enums import ColorInterp
 
     cell = lattice.cell
+    kind = (
+        {"count": 4, "photometric": "RGB", "alpha": "YES"}
+        if layer.picture
+        else {"count": 1, "nodata": layer.nodata}
+    )
     file = rasterio.open(
-        path, "w", driver="GTiff", width=lattice.columns, height=lattice.rows, count=1, dtype=layer.dtype,
-        nodata=layer.nodata, crs=lattice.crs, tiled=True, blockxsize=TILE, blockysize=TILE, SPARSE_OK=True,
-        BIGTIFF="IF_SAFER", transform=Affine(cell, 0.0, lattice.west * cell, 0.0, -cell, lattice.north * cell),
+        path, "w", driver="GTiff", width=lattice.columns, height=lattice.rows, dtype=layer.dtype,
+        crs=lattice.crs, tiled=True, blockxsize=TILE, blockysize=TILE, SPARSE_OK=True,
+        BIGTIFF="IF_SAFER", transform=Affine(cell, 0.0, lattice.west * cell, 0.0, -cell, lattice.north * cell), **kind,
     )  # fmt: skip
-    file.set_band_description(1, layer.doc)
-    file.set_band_unit(1, layer.unit)
-    file.scales, file.offsets = (layer.scale,), (layer.offset,)
+    if layer.picture:
+        file.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
+        file.update_tags(IMAGEDESCRIPTION=layer.doc)
+    else:
+        file.set_band_description(1, layer.doc)
+        file.set_band_unit(1, layer.unit)
+        file.scales, file.offsets = (layer.scale,), (layer.offset,)
     file.update_tags(AREA_OR_POINT="Area", **layer.tags)
     return file

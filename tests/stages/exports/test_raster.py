@@ -182,6 +182,61 @@ def test_intensity_from_above(tmp_path: Path) -> None:
         assert not next(iter(above.sample([outside[:2]]))).any()
 
 
+def painted(points: np.ndarray, seed: int = 7) -> dict[str, np.ndarray]:
+    """Colours of points: red and blue mixed by chance on the west half, green in the east but for a strip nobody saw."""
+    west = points[:, 0] < 0.0
+    red = np.random.default_rng(seed).random(len(points)) < 0.25
+    colour = np.where(west[:, None], np.where(red[:, None], (255, 0, 0), (0, 0, 255)), (0, 128, 0))
+    views = np.where(np.abs(points[:, 0] - 10.0) < 2.0, 0, 3)
+    colour[views == 0] = 0
+    return {"colour": colour.astype(np.uint8), "views": views.astype(np.uint16)}
+
+
+def test_colour_from_above(tmp_path: Path) -> None:
+    points, columns = roofed()
+    colours = painted(points)
+    lower = points[:, 2] < points[:, 2].max() - 0.5
+    under = lower & (points[:, 0] > 0.0)
+    colours["colour"][under] = (255, 255, 255)
+    source = delivered(tmp_path / "m", MUNICH, {}, points, columns=columns | colours)
+    top, _, picture = write_orthophoto(source, tmp_path, Options(cell_m=1.0))
+    assert picture.name == "colour_top.tif"
+    with rasterio.open(picture) as above, rasterio.open(top) as intensity:
+        assert above.dtypes == ("uint8",) * 4
+        assert [interpretation.name for interpretation in above.colorinterp] == [
+            "red",
+            "green",
+            "blue",
+            "alpha",
+        ]
+        assert above.crs.to_epsg() == MUNICH.epsg and above.bounds == intensity.bounds
+        assert above.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        places = [[-10.0, 3.0, 0.0], [5.0, 3.0, 0.0], [10.0, 3.0, 0.0], [0.0, 40.0, 0.0]]
+        west, east, unseen, outside = above.sample(world_to_projected(MUNICH, places)[:, :2])
+        whole = above.read()
+    red, _, blue = (((west[:3] / 255.0 + 0.055) / 1.055) ** 2.4).tolist()
+    assert 0.0 < red < 0.6 and red + blue == pytest.approx(1.0, abs=0.02)
+    assert west[1] == 0 and west[3] == 255
+    assert east.tolist() == [0, 128, 0, 255], "neither what is below nor what nobody saw"
+    assert unseen.tolist() == outside.tolist() == [0, 0, 0, 0]
+    half = whole[:, :, : whole.shape[2] // 2 - 2].reshape(4, -1)
+    mean = (((half[0, half[3] > 0] / 255.0 + 0.055) / 1.055) ** 2.4).mean()
+    assert mean == pytest.approx(0.25, abs=0.01), "light is averaged, not the numbers of a picture"
+
+
+def test_a_map_without_colours_has_no_picture(tmp_path: Path) -> None:
+    names = [
+        p.name
+        for p in write_orthophoto(delivered(tmp_path / "m", MUNICH, {}, plane(500)), tmp_path, Options())
+    ]
+    assert names == ["intensity_top.tif", "intensity_ground.tif"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "intensity_ground.tif",
+        "intensity_top.tif",
+        "m",
+    ]
+
+
 def test_intensity_of_nothing_but_zeros(tmp_path: Path) -> None:
     top, _ = write_orthophoto(delivered(tmp_path / "m", MUNICH, {}, plane(2000)), tmp_path, Options())
     with rasterio.open(top) as raster:
