@@ -24,6 +24,7 @@ from scanloom.schemas.scans import PointClass
 from scanloom.stages.exports.coordinates import Projector
 from scanloom.stages.exports.formats import FORMATS
 from scanloom.stages.exports.options import Options
+from scanloom.stages.exports.orthophoto import TOP_M
 from scanloom.stages.exports.source import MapSource
 from scanloom.stages.geometry.geodesy import ecef_pose, world_to_geodetic
 from scanloom.workflows.export_map import export_all
@@ -46,6 +47,8 @@ class Truth:
     poses: np.ndarray
     """(m, 3) of all sessions, in the map's frame."""
     ground: int
+    coloured: np.ndarray
+    """(n,) whether an image saw it."""
     epsg: int | None
 
     @classmethod
@@ -57,7 +60,8 @@ class Truth:
         tracks = [table.T_world_lidar[:, :3, 3] for table in source.trajectories().values()]
         ground = sum(int(np.count_nonzero(t.class_ == PointClass.GROUND)) for t in tiles)
         placed = projector.project(np.concatenate(xyz))
-        return cls(source, placed, np.concatenate(tracks), ground, projector.epsg)
+        coloured = np.concatenate([t.views > 0 for t in tiles])
+        return cls(source, placed, np.concatenate(tracks), ground, coloured, projector.epsg)
 
     @property
     def track(self) -> np.ndarray:
@@ -290,12 +294,21 @@ def ground_raster(folder: Path, truth: Truth) -> Seen:
 
 
 def orthophoto(folder: Path, truth: Truth) -> list[Seen]:
-    cells = len(np.unique(np.floor(truth.projected[:, :2] / 0.25).astype(np.int64), axis=0))
     import rasterio
 
+    _, cell = np.unique(np.floor(truth.projected[:, :2] / 0.25).astype(np.int64), axis=0, return_inverse=True)
     with rasterio.open(folder / "intensity_top.tif") as found:
         filled = int(np.count_nonzero(found.read(1)))
-    return [raster(folder / "intensity_top.tif", truth, filled, 0, cells)]
+    seen = [raster(folder / "intensity_top.tif", truth, filled, 0, int(cell.max()) + 1)]
+    if not truth.coloured.any():
+        return seen
+    highest = np.full(int(cell.max()) + 1, -np.inf, np.float32)
+    np.maximum.at(highest, cell.ravel(), truth.projected[:, 2].astype(np.float32))
+    on_top = truth.coloured & (truth.projected[:, 2] > highest[cell.ravel()] - TOP_M)
+    with rasterio.open(folder / "colour_top.tif") as found:
+        filled = int(np.count_nonzero(found.read(4)))
+    painted = len(np.unique(cell.ravel()[on_top]))
+    return [*seen, raster(folder / "colour_top.tif", truth, filled, 0, painted)]
 
 
 def stac(folder: Path, truth: Truth) -> list[Seen]:
