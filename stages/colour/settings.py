@@ -31,7 +31,7 @@ class Settings(BaseModel):
         description="a surface that is looked along, by a smaller cosine between ray and normal, or from behind, is not seen",
     )
     bare_m: float = Field(
-        15.0, ge=0.0, le=200.0,
+        20.0, ge=0.0, le=200.0,
         description="points without a surface (bushes, lone points) get no colour from farther than this, m",
     )  # fmt: skip
     alone: float = Field(
