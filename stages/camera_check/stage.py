@@ -18,7 +18,7 @@ from scanloom.schemas.trajectory import Odometry
 from scanloom.stages.camera_check.search import Fit, best_turn, comparable
 from scanloom.stages.camera_check.views import Footing, View, footing, moments, view
 
-VERSION = 4
+VERSION = 5
 LEAST_IMAGES, LEAST_POINTS = 8, 2000
 LEAST_GAIN_STD = 1.5
 """Standard deviations by which a turn must fit images better than none that had no part in finding it."""

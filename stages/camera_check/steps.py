@@ -50,13 +50,13 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True)
 class Steps:
-    """Pairs (n,) of neighbouring rays, by places at the range of the nearer of both: there a camera beside the LiDAR sees what
-    ends between them."""
+    """Pairs (n,) of neighbouring rays: both places as measured where one surface goes on between them; where it ends both at
+    the range of the nearer, as there a camera beside the LiDAR sees the end."""
 
     near: F8
     """(n, 3) m in the LiDAR's axes: measured."""
     beside: F8
-    """(n, 3) m: on the neighbouring ray, at the same range."""
+    """(n, 3) m: on the neighbouring ray."""
     kind: I8
     across: I8
     """0 between columns, 1 between rows of the scan."""
@@ -102,7 +102,7 @@ def _aside(cells: I8, cloud: _Cloud, across: int, side: int) -> tuple[F8, F8, I8
         kind[(kind == Kind.EVEN) | (kind == Kind.MARK)] = -1
     use = kind >= 0
     here, kind = here[use], kind[use]
-    beside = _beside(cloud, here, ahead[use], behind[use], kind == Kind.OPEN)
+    beside = _beside(cloud, here, ahead[use], behind[use], kind)
     return cloud.xyz[here], beside, kind, np.full(len(here), across)
 
 
@@ -134,11 +134,14 @@ def _kinds(cloud: _Cloud, here: I8, ahead: I8, behind: I8, beyond: I8, across: i
     return kind
 
 
-def _beside(cloud: _Cloud, here: I8, ahead: I8, behind: I8, opens: B1) -> F8:
-    """On the ray ahead, or as far from here as the one behind, at the range of here."""
+def _beside(cloud: _Cloud, here: I8, ahead: I8, behind: I8, kind: I8) -> F8:
+    """What was measured ahead on the same surface; for a surface that ends, at the range of here on the ray ahead, or on one
+    as far from here as that behind."""
     direction = cloud.xyz[ahead] / cloud.far[ahead, None]
+    opens = kind == Kind.OPEN
     before, last = here[opens], behind[opens]
     direction[opens] = (
         2.0 * cloud.xyz[before] / cloud.far[before, None] - cloud.xyz[last] / cloud.far[last, None]
     )
-    return np.asarray(cloud.far[here, None] * direction)
+    goes_on = (kind == Kind.EVEN) | (kind == Kind.MARK)
+    return np.asarray(np.where(goes_on, cloud.far[ahead], cloud.far[here])[:, None] * direction)

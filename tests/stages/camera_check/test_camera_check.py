@@ -245,15 +245,18 @@ def test_steps_are_where_something_changes() -> None:
     assert np.mean(kind == Kind.EVEN) > 0.8
 
 
-def test_beside_is_on_the_next_ray_as_far_away() -> None:
+def test_beside_is_what_the_next_ray_met_or_as_far_away_where_a_surface_ends() -> None:
     scan = scanned()
     found = steps(scan, np.ones(len(scan.x_m), bool))
-    hard = found.kind != Kind.OPEN
+    ends = found.kind == Kind.EDGE
     far = np.linalg.norm(found.near, axis=1)
     turn = np.degrees(
         np.arccos((found.near * found.beside).sum(axis=1) / far / np.linalg.norm(found.beside, axis=1))
     )
-    np.testing.assert_allclose(np.linalg.norm(found.beside, axis=1)[hard], far[hard], rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(found.beside, axis=1)[ends], far[ends], rtol=1e-6)
+    # from row to row the ground is met farther off, but no higher: a camera beside the LiDAR must look there
+    ground = (found.near[:, 2] < -1.99) & (found.kind == Kind.EVEN)
+    np.testing.assert_allclose(found.beside[ground, 2], found.near[ground, 2], atol=0.01)
     # a cell holds the nearer of two points where there are fewer columns than points
     for across, step in ((0, STEP_DEG), (1, 1.0)):
         assert 0.9 * step < np.quantile(turn[found.across == across], 0.1)
