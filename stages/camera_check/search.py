@@ -4,7 +4,7 @@ again."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
+from itertools import chain, product, repeat
 
 import numpy as np
 
@@ -19,6 +19,8 @@ COARSE_EVERY = 3
 COARSE_BLUR_PX, FINE_BLUR_PX = 4.0, 1.0
 REACHES_RAD = tuple(np.radians(reach) for reach in (0.4, 0.25, 0.15, 0.15))
 """Half width of the neighbourhood in which the distance is taken for a paraboloid, step after step."""
+MORE_STEPS, STILL_RAD = 6, np.radians(0.01)
+"""Of the last reach, and the step that is none."""
 DESIGN = np.array(list(product((-1.0, 0.0, 1.0), repeat=3)))
 DRAWS, BLOCK = 100, 4
 """Drawn sets of images; images in a row, that see much the same, are drawn together."""
@@ -103,9 +105,9 @@ def _only(views: list[View], grey: F4, part: B1) -> tuple[list[View], F4]:
 
 
 def _found(views: list[View], grey: F4, coarse: F8, fine: F8 | None = None) -> F8:
-    """Best turn from a coarse one on, or from none, or from a fine one, whichever ends best."""
-    near_none = float(np.abs(coarse).max()) <= REACHES_RAD[0]
-    ends = [_descended(views, grey, start) for start in ([] if near_none else [coarse]) + [np.zeros(3)]]
+    """Best turn from a coarse one on, and from none, and from a fine one, whichever ends best."""
+    starts = [np.zeros(3), coarse] if coarse.any() else [np.zeros(3)]
+    ends = [_descended(views, grey, start) for start in starts]
     if fine is not None:
         ends.append(_descended(views, grey, fine, REACHES_RAD[2:]))
     compared = scene(views, grey, margin_rad=WIDEST_RAD, at=np.zeros(3))
@@ -113,10 +115,15 @@ def _found(views: list[View], grey: F4, coarse: F8, fine: F8 | None = None) -> F
 
 
 def _descended(views: list[View], grey: F4, turn: F8, reaches_rad: tuple[float, ...] = REACHES_RAD) -> F8:
+    """By one step of each reach, and by more of the last one until they are small."""
     everything = np.ones((1, len(views)))
-    for reach in reaches_rad:
+    reaches = chain(reaches_rad, repeat(reaches_rad[-1], MORE_STEPS))
+    for number, reach in enumerate(reaches, 1):
         near = scene(views, grey, margin_rad=WIDEST_RAD, at=turn)
-        turn = np.clip(turn + _minima(near, reach, everything)[0], -WIDEST_RAD, WIDEST_RAD)
+        ahead = np.clip(turn + _minima(near, reach, everything)[0], -WIDEST_RAD, WIDEST_RAD)
+        if number >= len(reaches_rad) and np.abs(ahead - turn).max() < STILL_RAD:
+            return ahead
+        turn = ahead
     return turn
 
 
