@@ -120,7 +120,7 @@ def _descended(views: list[View], grey: F4, turn: F8, reaches_rad: tuple[float, 
     reaches = chain(reaches_rad, repeat(reaches_rad[-1], MORE_STEPS))
     for number, reach in enumerate(reaches, 1):
         near = scene(views, grey, margin_rad=WIDEST_RAD, at=turn)
-        ahead = np.clip(turn + _minima(near, reach, everything)[0], -WIDEST_RAD, WIDEST_RAD)
+        ahead: F8 = np.clip(turn + _minima(near, reach, everything)[0], -WIDEST_RAD, WIDEST_RAD)
         if number >= len(reaches_rad) and np.abs(ahead - turn).max() < STILL_RAD:
             return ahead
         turn = ahead
