@@ -127,23 +127,28 @@ def scene(views: list[View], grey: F4, *, margin_rad: float, at: F8, every: int 
     Steps that a turn of `margin_rad` about each axis could take out of the image are left out, so that the same ones are
     compared whatever the turn."""
     model = views[0].model
-    places = [np.concatenate([getattr(view, end)[::every] for view in views]) for end in ("near", "beside")]
-    kind, across = (
-        np.concatenate([getattr(view, of)[::every] for view in views]) for of in ("kind", "across")
-    )
-    number = np.repeat(np.arange(len(views)), [len(view.kind[::every]) for view in views])
+    places, kind, across, number = gathered(views, every)
     ends = [_linear(model, xyz, at) for xyz in places]
     pixel, slope = np.stack([p for p, _ in ends]), np.stack([s for _, s in ends])
     with np.errstate(invalid="ignore"):
         reach = margin_rad * np.abs(slope).sum(axis=3)
         size = np.array([model.width_px, model.height_px])
         inner = ((pixel > reach) & (pixel < size - 2 - reach)).all(axis=(0, 2))
-    number = number[inner]
     return Scene(
-        group=number.astype(np.int64), groups=len(views), kind=kind[inner], across=across[inner],
+        group=number[inner], groups=len(views), kind=kind[inner], across=across[inner],
         pixel=np.ascontiguousarray(pixel[:, inner]), slope=np.ascontiguousarray(slope[:, inner]),
         width=model.width_px, height=model.height_px, grey=grey,
     )  # fmt: skip
+
+
+def gathered(views: list[View], every: int) -> tuple[list[F8], I8, I8, I8]:
+    """Both places (n, 3) of all steps or of `every` second, third, ... of each view, their kinds, directions and views."""
+    places = [np.concatenate([getattr(view, end)[::every] for view in views]) for end in ("near", "beside")]
+    kind, across = (
+        np.concatenate([getattr(view, of)[::every] for view in views]) for of in ("kind", "across")
+    )
+    number = np.repeat(np.arange(len(views), dtype=np.int64), [len(view.kind[::every]) for view in views])
+    return places, kind, across, number
 
 
 def greys(views: list[View], blur_px: float) -> F4:

@@ -21,6 +21,8 @@ REACHES_RAD = tuple(np.radians(reach) for reach in (0.4, 0.25, 0.15, 0.15))
 """Half width of the neighbourhood in which the distance is taken for a paraboloid, step after step."""
 MORE_STEPS, STILL_RAD = 6, np.radians(0.01)
 """Of the last reach, and the step that is none."""
+HELD_RAD = np.radians(1.8)
+"""From none, all reaches together lead 1.85 deg about z, and about x and y the search stops at the widest turn: a fit from there on may be no minimum."""
 DESIGN = np.array(list(product((-1.0, 0.0, 1.0), repeat=3)))
 DRAWS, BLOCK = 100, 4
 """Drawn sets of images; images in a row, that see much the same, are drawn together."""
@@ -41,13 +43,19 @@ class Fit:
     gain_std: float
     """How much better than none a turn is for images that had no part in finding it, over the standard deviation of that."""
     points: int
+    held: bool
+    """Whether it is as far away as can be searched: the best may be farther."""
+
+    @property
+    def size_rad(self) -> float:
+        return float(np.linalg.norm(self.turn_rad))
 
 
-def best_turn(views: list[View]) -> Fit:
+def best_turn(views: list[View], calibrated: list[View] | None = None) -> Fit:
     """From the best of a coarse grid with blurred images, and from no turn at all, by paraboloids; the better of both.
 
     The same is done with every other block of images alone and with the rest, also from the turn of all: where both halves
-    prefer another turn, as they do where images tell nothing, the scatter is that between them.
+    prefer another turn, as they do where images tell nothing, the scatter is that between them. None is the camera as it is in `calibrated`: other views of the same images, or the same.
     """
     halves = [np.arange(len(views)) // BLOCK % 2 == half for half in (0, 1)]
     parts = [np.ones(len(views), bool), *halves]
@@ -56,7 +64,8 @@ def best_turn(views: list[View]) -> Fit:
     apart = [_found(*_only(views, grey, half), own, turn) for half, own in zip(halves, starts, strict=True)]
     drawn = _draws(len(views))
     compared = scene(views, grey, margin_rad=WIDEST_RAD, at=np.zeros(3))
-    before, after = compared.histograms(np.zeros(3)), compared.histograms(turn)
+    none = scene(calibrated, grey, margin_rad=WIDEST_RAD, at=np.zeros(3)) if calibrated else compared
+    before, after = none.histograms(np.zeros(3)), compared.histograms(turn)
     by_other = np.where(
         halves[0][:, None, None, None], *(compared.histograms(other) for other in apart[::-1])
     )
@@ -67,6 +76,7 @@ def best_turn(views: list[View]) -> Fit:
     return Fit(
         turn, np.hypot(scatter, FLOOR_RAD), float(nid(before.sum(axis=0))), float(nid(after.sum(axis=0))),
         float(gain.mean() / max(float(gain.std(ddof=1)), 1e-12)), len(compared.kind),
+        bool(np.abs(turn).max() > HELD_RAD),
     )  # fmt: skip
 
 

@@ -11,17 +11,22 @@ from __future__ import annotations
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from scanloom.schemas.cameras import Agreement, Camera, CameraAgreement, CameraCheck, Cameras, Images
+from scanloom.schemas.cameras import Agreement, Camera, CameraAgreement, CameraCheck, Cameras, Image, Images
 from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import Deskewed, Labels
 from scanloom.schemas.trajectory import Odometry
+from scanloom.stages.camera_check.far import GRID_RAD, GRID_STEPS, farther
 from scanloom.stages.camera_check.search import Fit, best_turn, comparable
 from scanloom.stages.camera_check.views import Footing, View, footing, moments, view
+from scanloom.stages.geometry.se3 import F8, pose, so3_exp
+from scanloom.stages.logs.mounting import as_matrix4
 
-VERSION = 5
+VERSION = 6
 LEAST_IMAGES, LEAST_POINTS = 8, 2000
 LEAST_GAIN_STD = 1.5
 """Standard deviations by which a turn must fit images better than none that had no part in finding it."""
+LARGE_RAD, LARGE_TELLS = np.radians(1.0), 1.5
+"""So far from where it fits a calibration tells little of the images: a turn as large that tells of them not so many times as much fits by chance."""
 
 
 class Settings(BaseModel):
@@ -81,15 +86,18 @@ def check_camera(
 ) -> CameraAgreement:
     """One camera; `unknown` where too little was seen."""
     parts = list(images)
-    views: list[View] = []
-    for _, part, number in moments(images, camera.name, settings.images):
-        seen = view(camera, parts[part][number], ground, settings.scans, settings.points)
-        if seen is not None and len(seen.kind):
-            views.append(seen)
+    looked = [parts[part][number] for _, part, number in moments(images, camera.name, settings.images)]
+    views = [each for each in _views(settings, camera, looked, ground) if len(each.kind)]
     points = comparable(views) if views else 0
     if len(views) < LEAST_IMAGES or points < LEAST_POINTS:
         return CameraAgreement(camera=camera.name, images=len(views), points=points)
     fit = best_turn(views)
+    if judged(settings, fit) == "unknown" or fit.size_rad > LARGE_RAD:
+        stamps = {each.stamp_ns for each in views}
+        used = [image for image in looked if image.stamp_ns in stamps]
+        fit = farther(
+            views, fit, lambda turn: _views(settings, _turned(camera, turn), used, ground), np.radians(settings.doubt_deg)
+        )  # fmt: skip
     # points move by the turn where the camera moved by its inverse
     offset, std = np.degrees(-fit.turn_rad), np.degrees(fit.std_rad)
     return CameraAgreement(
@@ -99,10 +107,24 @@ def check_camera(
     )  # fmt: skip
 
 
+def _views(settings: Settings, camera: Camera, images: list[Image], ground: Footing) -> list[View]:
+    """Of the images that can be used; some may show nothing of the scans."""
+    seen = (view(camera, image, ground, settings.scans, settings.points) for image in images)
+    return [each for each in seen if each is not None]
+
+
+def _turned(camera: Camera, turn_rad: F8) -> Camera:
+    """The camera for which points are turned by a vector about its axes."""
+    T = np.array(camera.T_lidar_camera) @ pose(so3_exp(-turn_rad), np.zeros(3))
+    return camera.model_copy(update={"T_lidar_camera": as_matrix4(T)})
+
+
 def judged(settings: Settings, fit: Fit) -> Agreement:
     """Moved: far enough, and beyond doubt. Agrees: not far, a standard deviation more included, and known well enough."""
-    size = float(np.degrees(np.linalg.norm(fit.turn_rad)))
-    along = fit.turn_rad / max(float(np.linalg.norm(fit.turn_rad)), 1e-12)
+    size = float(np.degrees(fit.size_rad))
+    if fit.held or (fit.size_rad > LARGE_RAD and 1.0 - fit.nid_best < LARGE_TELLS * (1.0 - fit.nid)):
+        return "unknown"
+    along = fit.turn_rad / max(fit.size_rad, 1e-12)
     std = float(np.degrees(np.linalg.norm(fit.std_rad * along)))
     clear = fit.gain_std > LEAST_GAIN_STD and size > settings.sure * std
     if size > settings.moved_deg:
@@ -129,6 +151,11 @@ def _doubt(settings: Settings, found: CameraAgreement) -> str:
     """Why it cannot be told."""
     if not np.isfinite(found.nid):
         return f"{found.points} pairs of points were seen in them; {LEAST_IMAGES} images and {LEAST_POINTS} pairs are the least"
+    if found.turned_deg > np.degrees(LARGE_RAD):
+        return (
+            f"they fit the scans well at no turn that was tried, up to {np.degrees(GRID_STEPS * GRID_RAD):.0f} deg about each axis; "
+            "it may have turned farther, or the calibration may be another camera's"
+        )
     if found.turned_deg > settings.moved_deg:
         return f"a turn of {found.turned_deg:.2f} deg would fit best, but not clearly better than none"
     if max(found.std_deg) < settings.doubt_deg:

@@ -12,7 +12,7 @@ import pytest
 from scanloom.schemas.cameras import CameraAgreement, CameraModel, Cameras, Image, Images
 from scanloom.schemas.product import Parts
 from scanloom.schemas.scans import Deskewed, DeskewedScan, Labels, PointClass
-from scanloom.stages.camera_check import Settings, camera_check, search
+from scanloom.stages.camera_check import Settings, camera_check, far, search
 from scanloom.stages.camera_check.distance import BINS, F4, nid
 from scanloom.stages.camera_check.search import REACHES_RAD, Fit
 from scanloom.stages.camera_check.stage import LEAST_IMAGES, judged
@@ -137,6 +137,24 @@ def noise(image: Image, rng: np.random.Generator) -> Image:
     return replace(image, data=np.asarray(cv2.imencode(".png", pixels)[1], np.uint8).reshape(-1))
 
 
+@pytest.mark.parametrize("turn", [(1.7, -1.2, 1.9), (2.4, 0.3, -0.2), (-3.0, 4.5, 5.0), (0.0, -9.5, 0.0)])
+def test_a_camera_that_was_knocked_aside_is_found(
+    turn: tuple[float, float, float], recorded: Recorded
+) -> None:
+    found = check(recorded, turn)
+    assert found.verdict == "moved" and found.images == 16
+    np.testing.assert_allclose(found.offset_deg, turn, atol=0.15)
+    assert max(found.std_deg) < 0.12 and found.nid_best < found.nid - 0.01
+
+
+@pytest.mark.parametrize("turn", [(0.0, 16.0, 0.0), (9.0, 20.0, -25.0), (0.0, 90.0, 0.0)])
+def test_a_turn_that_is_too_large_is_not_told_as_another(
+    turn: tuple[float, float, float], recorded: Recorded
+) -> None:
+    found = check(recorded, turn)
+    assert found.verdict == "unknown" and "cannot be told" in found.remark
+
+
 def test_images_of_something_else_tell_nothing(recorded: Recorded) -> None:
     rng = np.random.default_rng(2)
     strange = [Images([noise(image, rng) for image in part]) for part in recorded.images]
@@ -189,10 +207,12 @@ def test_where_there_is_nothing_nothing_is_read(given: str, recorded: Recorded) 
 # --- its parts -------------------------------------------------------------------------------------------------------
 
 
-def fit(turn_deg: float, std_deg: float, gain_std: float) -> Fit:
+def fit(
+    turn_deg: float, std_deg: float, gain_std: float, *, nid_best: float = 0.97, held: bool = False
+) -> Fit:
     return Fit(
-        np.radians([turn_deg, 0.0, 0.0]), np.radians([std_deg, 0.01, 0.01]), 0.98, 0.97, gain_std, 9999
-    )
+        np.radians([turn_deg, 0.0, 0.0]), np.radians([std_deg, 0.01, 0.01]), 0.98, nid_best, gain_std, 9999, held
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -204,6 +224,73 @@ def fit(turn_deg: float, std_deg: float, gain_std: float) -> Fit:
 )  # fmt: skip
 def test_limits_of_the_verdict(turn: float, std: float, gain: float, verdict: str) -> None:
     assert judged(Settings(), fit(turn, std, gain)) == verdict
+
+
+@pytest.mark.parametrize(
+    ("turn", "nid_best", "held", "verdict"),
+    [
+        (1.01, 0.9699, False, "moved"), (1.01, 0.9701, False, "unknown"), (0.99, 0.9701, False, "moved"),
+        (1.85, 0.9, True, "unknown"), (1.85, 0.9, False, "moved"),
+    ],
+)  # fmt: skip
+def test_large_turns_have_to_tell_more(turn: float, nid_best: float, held: bool, verdict: str) -> None:
+    assert judged(Settings(), fit(turn, 0.05, 9.0, nid_best=nid_best, held=held)) == verdict
+
+
+NEAR = fit(1.9, 0.05, 2.0, nid_best=0.96, held=True)
+IN_DOUBT = fit(0.2, 0.2, 0.0, nid_best=0.97)
+
+
+@pytest.mark.parametrize(
+    ("near", "nid_best", "std_deg", "held", "taken"),
+    [
+        (IN_DOUBT, 0.9699, 0.1, False, True), (IN_DOUBT, 0.9701, 0.1, False, False),
+        (NEAR, 0.9639, 0.1, False, True), (NEAR, 0.9641, 0.1, False, False),
+        (IN_DOUBT, 0.9, 0.119, False, True), (IN_DOUBT, 0.9, 0.121, False, False), (IN_DOUBT, 0.9, 0.1, True, False),
+    ],
+)  # fmt: skip
+def test_another_fit_is_taken_where_it_is_better_and_sharp(
+    near: Fit, nid_best: float, std_deg: float, held: bool, taken: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = np.radians([4.0, 0.0, -2.0])
+    monkeypatch.setattr(far, "_starts", lambda _: [start])
+    monkeypatch.setattr(far, "comparable", lambda _: far.LEAST_STEPS)
+    there = replace(fit(0.0, std_deg, 9.0, nid_best=nid_best, held=held), std_rad=np.radians([std_deg] * 3))
+    monkeypatch.setattr(far, "best_turn", lambda *_: there)
+    found = far.farther([], near, lambda _: [], np.radians(0.12))
+    if taken:
+        np.testing.assert_allclose(found.turn_rad, near.turn_rad if near.held else start, atol=1e-12)
+    else:
+        assert found is near
+
+
+@pytest.mark.parametrize(("steps", "looked"), [(far.LEAST_STEPS, 1), (far.LEAST_STEPS - 1, 0)])
+def test_where_too_little_is_left_in_the_image_nothing_is_searched(
+    steps: int, looked: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[object] = []
+    monkeypatch.setattr(far, "_starts", lambda _: [np.radians([4.0, 0.0, 0.0])])
+    monkeypatch.setattr(far, "comparable", lambda _: steps)
+    monkeypatch.setattr(far, "best_turn", lambda *views: seen.append(views) or NEAR)
+    assert far.farther([], IN_DOUBT, lambda _: [], np.radians(0.12)) is IN_DOUBT
+    assert len(seen) == looked
+
+
+def test_a_narrow_lens_has_no_grid() -> None:
+    """At the largest turns everything is out of its image; a wide one keeps what is near its middle."""
+    rng = np.random.default_rng(4)
+    count = far.EVERY * far.LEAST_STEPS
+    places = np.column_stack((rng.uniform(-0.5, 0.5, (count, 2)), np.full(count, 10.0)))
+    kind = rng.integers(0, 2, count)
+    for fx_px, narrow in ((290.0, False), (2900.0, True)):
+        model = CameraModel(
+            lens="pinhole", width_px=480, height_px=300, fx_px=fx_px, fy_px=fx_px, cx_px=240, cy_px=150
+        )
+        one = View(0, np.zeros((300, 480), np.uint8), model, places, places, kind, kind)
+        assert (
+            far._staying([one], np.radians([[10.0, 10, 10], [-10, -10, -10]]))[1].kind.size == 0
+        ) is narrow
+        assert bool(far._starts([one] * 8)) is not narrow
 
 
 def joint(*along: np.ndarray) -> np.ndarray:
