@@ -63,10 +63,14 @@ def main() -> None:
     for seed in range(before, options.first):
         made = produced(_drive(seed, options.seconds, options.turn_deg), READ, options.store)
         turned += _told(_checked(seed, made, options.seconds, options.turn_deg, 0.0))
-    figures = list(_figures([row for row in rows if not row.turned], "untouched"))
-    figures += _figures([row for row in rows if row.turned], "turned")
-    figures += _figures(turned, "turned_in_drive") if turned else []
-    published(figures, options.json)
+    sets = {
+        "untouched": [row for row in rows if not row.turned],
+        "turned": [row for row in rows if row.turned],
+        "turned_in_drive": turned,
+    }
+    published(
+        [figure for name, some in sets.items() if some for figure in _figures(some, name)], options.json
+    )
 
 
 def _options() -> argparse.Namespace:
@@ -144,6 +148,8 @@ def _figures(rows: list[Checked], name: str) -> Iterator[Figure]:
         share = float(np.mean([row.found.verdict == verdict for row in rows]))
         yield Figure(f"camera_check.{name}.{verdict}", share, "", "run", f"share that is said so; {where}")
     judged = [row for row in rows if row.found.verdict != "unknown"]
+    if not judged:
+        return
     error, std = (
         np.array([row.error_deg if of == "error" else row.found.std_deg for row in judged])
         for of in ("error", "std")
