@@ -21,6 +21,8 @@ GRID_RAD, GRID_STEPS = np.radians(2.0), 5
 EVERY = 5
 KEPT = 0.9
 """Of what a fit at the limit tells of the images the one about it has to tell: other steps are in the image there."""
+FOLLOWED = 3
+"""Searches one after the other, each from the limit of the one before."""
 LEAST_STEPS = 1000
 """That stay in the image at all turns of the grid, or from one of them on; a lens too narrow for the grid is searched from none only."""
 
@@ -30,8 +32,7 @@ def farther(views: list[View], near: Fit, seen: Callable[[F8], list[View]], doub
 
     `seen` gives the views of the camera whose points are turned by a vector about its axes."""
     starts = ([near.turn_rad] if near.held else []) + _starts(views)
-    looked = [(start, seen(start)) for start in starts]
-    fits = [_from(start, views, there) for start, there in looked if comparable(there) >= LEAST_STEPS]
+    fits = [fit for start in starts if (fit := _followed(start, views, seen)) is not None]
     told = (1.0 - near.nid_best) * (KEPT if near.held else 1.0)
     better = [
         fit for fit in fits if not fit.held and fit.std_rad.max() < doubt_rad and 1.0 - fit.nid_best > told
@@ -39,10 +40,19 @@ def farther(views: list[View], near: Fit, seen: Callable[[F8], list[View]], doub
     return min(better, key=lambda fit: fit.nid_best, default=near)
 
 
-def _from(start: F8, calibrated: list[View], views: list[View]) -> Fit:
-    """What fits best about a turn, and how much better than none it is."""
-    fit = best_turn(views, calibrated)
-    return replace(fit, turn_rad=so3_log(so3_exp(fit.turn_rad) @ so3_exp(start)))
+def _followed(start: F8, calibrated: list[View], seen: Callable[[F8], list[View]]) -> Fit | None:
+    """What fits best about a turn, and how much better than none it is; from where a search ends at its limit another one begins."""
+    fit = None
+    for _ in range(FOLLOWED):
+        views = seen(start)
+        if comparable(views) < LEAST_STEPS:
+            return None
+        about = best_turn(views, calibrated)
+        start = so3_log(so3_exp(about.turn_rad) @ so3_exp(start))
+        fit = replace(about, turn_rad=start)
+        if not fit.held:
+            break
+    return fit
 
 
 def _starts(views: list[View]) -> list[F8]:
