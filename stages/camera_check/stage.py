@@ -25,8 +25,9 @@ VERSION = 6
 LEAST_IMAGES, LEAST_POINTS = 8, 2000
 LEAST_GAIN_STD = 1.5
 """Standard deviations by which a turn must fit images better than none that had no part in finding it."""
-LARGE_RAD, LARGE_TELLS = np.radians(1.0), 1.5
-"""So far from where it fits a calibration tells little of the images: a turn as large that tells of them not so many times as much fits by chance."""
+LARGE_RAD, LARGE_TELLS = np.radians(1.0), 2.5
+"""So far from where it fits a calibration tells little of the images: a turn as large that is not known well fits by chance, unless it
+tells of them that many times as much."""
 
 
 class Settings(BaseModel):
@@ -122,14 +123,15 @@ def _turned(camera: Camera, turn_rad: F8) -> Camera:
 def judged(settings: Settings, fit: Fit) -> Agreement:
     """Moved: far enough, and beyond doubt. Agrees: not far, a standard deviation more included, and known well enough."""
     size = float(np.degrees(fit.size_rad))
-    if fit.held or (fit.size_rad > LARGE_RAD and 1.0 - fit.nid_best < LARGE_TELLS * (1.0 - fit.nid)):
+    known = float(np.degrees(fit.std_rad).max()) < settings.doubt_deg
+    telling = known or 1.0 - fit.nid_best > LARGE_TELLS * (1.0 - fit.nid)
+    if fit.held or (fit.size_rad > LARGE_RAD and not telling):
         return "unknown"
     along = fit.turn_rad / max(fit.size_rad, 1e-12)
     std = float(np.degrees(np.linalg.norm(fit.std_rad * along)))
     clear = fit.gain_std > LEAST_GAIN_STD and size > settings.sure * std
     if size > settings.moved_deg:
         return "moved" if clear else "unknown"
-    known = float(np.degrees(fit.std_rad).max()) < settings.doubt_deg
     return "agrees" if known and size + std < settings.moved_deg else "unknown"
 
 

@@ -227,14 +227,17 @@ def test_limits_of_the_verdict(turn: float, std: float, gain: float, verdict: st
 
 
 @pytest.mark.parametrize(
-    ("turn", "nid_best", "held", "verdict"),
+    ("turn", "std", "nid_best", "held", "verdict"),
     [
-        (1.01, 0.9699, False, "moved"), (1.01, 0.9701, False, "unknown"), (0.99, 0.9701, False, "moved"),
-        (1.85, 0.9, True, "unknown"), (1.85, 0.9, False, "moved"),
+        (1.01, 0.119, 0.97, False, "moved"), (1.01, 0.121, 0.97, False, "unknown"), (0.99, 0.121, 0.97, False, "moved"),
+        (1.01, 0.121, 0.9499, False, "moved"), (1.01, 0.121, 0.9501, False, "unknown"),
+        (1.85, 0.05, 0.9, True, "unknown"), (1.85, 0.05, 0.9, False, "moved"),
     ],
 )  # fmt: skip
-def test_large_turns_have_to_tell_more(turn: float, nid_best: float, held: bool, verdict: str) -> None:
-    assert judged(Settings(), fit(turn, 0.05, 9.0, nid_best=nid_best, held=held)) == verdict
+def test_large_turns_are_known_well_or_tell_much_more(
+    turn: float, std: float, nid_best: float, held: bool, verdict: str
+) -> None:
+    assert judged(Settings(), fit(turn, std, 9.0, nid_best=nid_best, held=held)) == verdict
 
 
 NEAR = fit(1.9, 0.05, 2.0, nid_best=0.96, held=True)
@@ -264,7 +267,20 @@ def test_another_fit_is_taken_where_it_is_better_and_sharp(
         assert found is near
 
 
-@pytest.mark.parametrize(("steps", "looked"), [(far.LEAST_STEPS, 1), (far.LEAST_STEPS - 1, 0)])
+@pytest.mark.parametrize(("ends", "looked"), [((True, False), 2), ((True,) * 9, far.FOLLOWED), ((False,), 1)])
+def test_a_search_that_ends_at_its_limit_is_followed(
+    ends: tuple[bool, ...], looked: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[F8] = []
+    found = iter(fit(1.85, 0.05, 9.0, nid_best=0.9, held=held) for held in ends)
+    monkeypatch.setattr(far, "comparable", lambda _: far.LEAST_STEPS)
+    monkeypatch.setattr(far, "best_turn", lambda *_: next(found))
+    last = far._followed(np.zeros(3), [], lambda turn: seen.append(turn) or [])
+    assert last is not None and last.held is ends[looked - 1] and len(seen) == looked
+    np.testing.assert_allclose(np.degrees(last.turn_rad), [1.85 * looked, 0.0, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(("steps", "looked"), [(far.LEAST_STEPS, far.FOLLOWED), (far.LEAST_STEPS - 1, 0)])
 def test_where_too_little_is_left_in_the_image_nothing_is_searched(
     steps: int, looked: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
