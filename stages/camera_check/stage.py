@@ -3,7 +3,7 @@
 Neighbouring points of what stands still are put into a few dozen images as the calibration says. Where a camera has been
 turned since, some small turn makes the steps of grey and those of the scans tell more of each other. It is searched for, its
 scatter is found by drawing images again and from their halves, and a camera is said to have moved when the turn is larger than a limit, beyond
-doubt, and clearly better than none.
+doubt, and clearly better than none. Where that search ends far from none or in doubt, others begin on a grid of large turns.
 """
 
 from __future__ import annotations
